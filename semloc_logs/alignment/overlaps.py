@@ -6,8 +6,11 @@ borders: for each cell a mask has the classes of all voxels that may be closest 
 one look-up gives bounds of tau; the closest voxel itself is looked for in hypotheses whose upper
 bound is among the best, and there only for voxels that the mask leaves open.
 
-Masks are made when a cell is looked at first: numbers of a palette of masks, one byte a cell of a
-dense grid, whose memory is used where something was looked up.
+An observed voxel whose six neighbours are observed is not the closest to any point outside of it:
+one of these is. So only voxels beside unobserved ones, the *border*, are looked at.
+
+Masks are made when a cube of cells is looked at first: numbers of a palette of masks, one byte a
+cell of a dense grid, whose memory is used where something was looked up.
 """
 
 from __future__ import annotations
@@ -36,12 +39,15 @@ NOT_ALIGNED = np.uint32(1 << 31)  # free space, or nothing within kappa
 ANYTHING = np.uint32(0xFFFFFFFF)
 NOT_MADE, ANY_MASK = 0, 1  # numbers of the palette
 PALETTE = 256
-MARGIN = (96, 96, 48)  # voxels of the grid around the blocks, so that look-ups seldom leave it
+# voxels of the grid around the blocks, so that look-ups seldom leave it; whole cubes
+MARGIN = (96, 96, 48)
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
 CHUNK = 512  # voxels counted between two checks whether a hypothesis can be among the best
 CUBES = BLOCK // CUBE  # along the edge of a block
 # of a map, in the order of its fields
-Arrays = tuple[I32, I64, U8, U64, U8, I64, U32, float]
+Arrays = tuple[I32, I64, U8, U64, U32, U8, I64, U32, float]
+Grid = tuple[I32, I64, U8]  # the first three of them
+Around = tuple[I64, U64, U32, F64]  # cubes: places, border, bits, squares of least distances
 Offsets = tuple[I64, F64]  # of cubes, and the squares of their least distances
 
 
@@ -58,15 +64,17 @@ class OverlapMap:
     """A target's voxels by blocks, and the masks of its cells.
 
     ``number`` (x, y, z) is the row of each block from block ``first`` (3,) on, -1 without one;
-    ``state`` (rows, 4096) has voxel states, ``observed`` (rows, 64) which cells of each cube are
-    observed. ``mask`` (x, y, z), from voxel ``low`` (3,) on, has numbers of the ``palette``, made
-    when needed. Points farther than ``reach`` voxels from all observed ones are not aligned.
+    ``state`` (rows, 4096) has voxel states, ``border`` (rows, 64) which cells of each cube are
+    observed beside unobserved ones, ``present`` (rows, 64) the bits of their states. ``mask`` (x,
+    y, z), from voxel ``low`` (3,) on, has numbers of the ``palette``, made when needed. Points
+    farther than ``reach`` voxels from all observed ones are not aligned.
     """
 
     number: I32
     first: I64
     state: U8
-    observed: U64
+    border: U64
+    present: U32
     mask: U8
     low: I64
     palette: U32
@@ -79,7 +87,8 @@ class OverlapMap:
             self.number,
             self.first,
             self.state,
-            self.observed,
+            self.border,
+            self.present,
             self.mask,
             self.low,
             self.palette,
@@ -109,27 +118,51 @@ def overlap_map(target: BlockMap, reach: float, *, free: bool = True) -> Overlap
     state[: len(blocks)] = target.state
     if not free:
         state[state == FREE_STATE] = UNOBSERVED_STATE
-    observed = np.zeros((rows, CUBES**3), np.uint64)
-    _mark_observed(state[: len(blocks)], observed)
+    border = np.zeros((rows, CUBES**3), np.uint64)
+    present = np.zeros((rows, CUBES**3), np.uint32)
+    _mark_border((number, first, state), blocks, border, present)
     palette = np.zeros(PALETTE, np.uint32)
     palette[ANY_MASK] = ANYTHING
     margin = np.array(MARGIN, np.int64)
     low = first * BLOCK - margin
     mask = np.zeros(tuple(((last + 1) * BLOCK + margin - low).tolist()), np.uint8)
-    return OverlapMap(number, first, state, observed, mask, low, palette, reach)
+    return OverlapMap(number, first, state, border, present, mask, low, palette, reach)
 
 
 @njit(cache=True, nogil=True)
-def _mark_observed(state: U8, observed: U64) -> None:
-    for row in range(len(state)):
+def _mark_border(grid: Grid, blocks: I64, border: U64, present: U32) -> None:
+    """Fill the rows of ``blocks`` (n, 3) in ``border`` and ``present``."""
+    state = grid[2]
+    for row in range(len(blocks)):
         for m in range(BLOCK**3):
-            if state[row, m] != UNOBSERVED_STATE:
-                x = m >> 8
-                y = (m >> 4) & 15
-                z = m & 15
+            if state[row, m] == UNOBSERVED_STATE:
+                continue
+            x = m >> 8
+            y = (m >> 4) & 15
+            z = m & 15
+            if _is_border(
+                grid,
+                BLOCK * blocks[row, 0] + x,
+                BLOCK * blocks[row, 1] + y,
+                BLOCK * blocks[row, 2] + z,
+            ):
                 cube = ((x >> 2) * CUBES + (y >> 2)) * CUBES + (z >> 2)
                 bit = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
-                observed[row, cube] |= np.uint64(1) << np.uint64(bit)
+                border[row, cube] |= np.uint64(1) << np.uint64(bit)
+                present[row, cube] |= _bit_of(state[row, m])
+
+
+@njit(cache=True, nogil=True)
+def _is_border(grid: Grid, x: int, y: int, z: int) -> bool:
+    """Whether one of the six neighbours of a voxel is unobserved."""
+    return (
+        _state_at(grid, x - 1, y, z) == UNOBSERVED_STATE
+        or _state_at(grid, x + 1, y, z) == UNOBSERVED_STATE
+        or _state_at(grid, x, y - 1, z) == UNOBSERVED_STATE
+        or _state_at(grid, x, y + 1, z) == UNOBSERVED_STATE
+        or _state_at(grid, x, y, z - 1) == UNOBSERVED_STATE
+        or _state_at(grid, x, y, z + 1) == UNOBSERVED_STATE
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -157,12 +190,13 @@ def _cell_of(x: int, y: int, z: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _observed_cube(arrays: Arrays, x: int, y: int, z: int) -> np.uint64:
-    """The observed cells of the cube (x, y, z), in cubes."""
+def _border_of(arrays: Arrays, x: int, y: int, z: int) -> tuple[np.uint64, np.uint32]:
+    """The border cells of the cube (x, y, z), in cubes, and the bits of their states."""
     row = _row_of(arrays[0], arrays[1], x << 2, y << 2, z << 2)
     if row < 0:
-        return np.uint64(0)
-    return np.uint64(arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)])
+        return np.uint64(0), np.uint32(0)
+    cube = (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)
+    return arrays[3][row, cube], arrays[4][row, cube]
 
 
 @njit(cache=True, nogil=True)
@@ -174,9 +208,16 @@ def _closest(
     Only those nearer than ``bound`` (squared) count; without one the distance is ``bound``.
     """
     offset, least = offsets
-    cx = int(np.floor(point[0])) >> 2
-    cy = int(np.floor(point[1])) >> 2
-    cz = int(np.floor(point[2])) >> 2
+    x = int(np.floor(point[0]))
+    y = int(np.floor(point[1]))
+    z = int(np.floor(point[2]))
+    if _state_at(arrays[:3], x, y, z) != UNOBSERVED_STATE:
+        # no other centre is as close as that of the voxel that a point lies in
+        own = (point[0] - x - 0.5) ** 2 + (point[1] - y - 0.5) ** 2 + (point[2] - z - 0.5) ** 2
+        return min(own, bound), x, y, z
+    cx = x >> 2
+    cy = y >> 2
+    cz = z >> 2
     best = bound
     found = (0, 0, 0)
     for m in range(len(offset)):
@@ -185,19 +226,20 @@ def _closest(
         x = cx + offset[m, 0]
         y = cy + offset[m, 1]
         z = cz + offset[m, 2]
-        observed = _observed_cube(arrays, x, y, z)
-        if observed == 0:
+        border, _ = _border_of(arrays, x, y, z)
+        if border == 0:
             continue
-        best, bit = closest_in_cube(observed, (x, y, z), point, best)
+        best, bit = closest_in_cube(border, (x, y, z), point, best)
         if bit >= 0:
             found = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
     return best, found[0], found[1], found[2]
 
 
 @njit(cache=True, nogil=True)
-def _state_at(arrays: Arrays, x: int, y: int, z: int) -> int:
-    row = _row_of(arrays[0], arrays[1], x, y, z)
-    return int(arrays[2][row, _cell_of(x, y, z)]) if row >= 0 else UNOBSERVED_STATE
+def _state_at(grid: Grid, x: int, y: int, z: int) -> int:
+    number, first, state = grid
+    row = _row_of(number, first, x, y, z)
+    return int(state[row, _cell_of(x, y, z)]) if row >= 0 else UNOBSERVED_STATE
 
 
 @njit(cache=True, nogil=True)
@@ -208,39 +250,95 @@ def _bit_of(state: int) -> np.uint32:
 
 
 @njit(cache=True, nogil=True)
-def _mask_of(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
-    """The bits of all voxels that may be closest to a point in the cell (x, y, z)."""
-    if _row_of(arrays[0], arrays[1], x, y, z) < 0:
-        return NOT_ALIGNED
-    reach = arrays[7]
-    state = _state_at(arrays, x, y, z)
-    if state != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
-        return _bit_of(state)
-    centre = (x + 0.5, y + 0.5, z + 0.5)
+def _make_masks(arrays: Arrays, cube: tuple[int, int, int], offsets: Offsets) -> None:
+    """Make the masks of all cells of a ``cube``: the bits of all voxels that may be closest to a
+    point in the cell.
+    """
+    number, first, state, _, _, mask, low, palette, reach = arrays
+    x = CUBE * cube[0]
+    y = CUBE * cube[1]
+    z = CUBE * cube[2]
+    is_near = _row_of(number, first, x, y, z) >= 0
+    around = _cubes_around(arrays, cube, offsets, reach + HALF_DIAGONAL)
+    for cell in range(CUBE**3):
+        i = x + (cell >> 4)
+        j = y + ((cell >> 2) & 3)
+        k = z + (cell & 3)
+        bits = NOT_ALIGNED
+        if is_near:
+            own = _state_at((number, first, state), i, j, k)
+            if own != UNOBSERVED_STATE:
+                bits = _bit_of(own)
+                if reach <= HALF_DIAGONAL:
+                    bits |= NOT_ALIGNED
+            elif len(around[0]):
+                bits = _mask_of(arrays, (i, j, k), around)
+        mask[i - low[0], j - low[1], k - low[2]] = _number_of(palette, bits)
+
+
+@njit(cache=True, nogil=True)
+def _cubes_around(
+    arrays: Arrays, cube: tuple[int, int, int], offsets: Offsets, far: float
+) -> Around:
+    """The cubes with border cells that may lie within ``far`` of a cell's middle in ``cube``."""
+    offset, least = offsets
+    places = np.empty((len(offset), 3), np.int64)
+    borders = np.empty(len(offset), np.uint64)
+    presents = np.empty(len(offset), np.uint32)
+    leasts = np.empty(len(offset))
+    count = 0
+    for m in range(len(offset)):
+        if least[m] > far * far:
+            break
+        x = cube[0] + offset[m, 0]
+        y = cube[1] + offset[m, 1]
+        z = cube[2] + offset[m, 2]
+        border, present = _border_of(arrays, x, y, z)
+        if border:
+            places[count, 0] = x
+            places[count, 1] = y
+            places[count, 2] = z
+            borders[count] = border
+            presents[count] = present
+            leasts[count] = least[m]
+            count += 1
+    return places[:count], borders[:count], presents[:count], leasts[:count]
+
+
+@njit(cache=True, nogil=True)
+def _mask_of(arrays: Arrays, cell: tuple[int, int, int], around: Around) -> np.uint32:
+    """The bits of all voxels of the cubes ``around`` that may be closest to a point in the cell."""
+    places, borders, presents, leasts = around
+    reach = arrays[8]
     far = reach + HALF_DIAGONAL
-    nearest, _, _, _ = _closest(arrays, centre, offsets, far * far)
+    x, y, z = cell
+    middle = (x + 0.5, y + 0.5, z + 0.5)
+    nearest = far * far
+    for m in range(len(leasts)):
+        if leasts[m] >= nearest:
+            break
+        place = (places[m, 0], places[m, 1], places[m, 2])
+        nearest, _ = closest_in_cube(borders[m], place, middle, nearest)
     if nearest >= far * far:
         return NOT_ALIGNED
     away = np.sqrt(nearest)
     mask = NOT_ALIGNED if away + HALF_DIAGONAL >= reach else np.uint32(0)
     # a little more, for the rounding of points
     radius = min(away + 2 * HALF_DIAGONAL + 1e-6, far)
-    offset, least = offsets
-    for m in range(len(offset)):
-        if least[m] > radius * radius:
+    for m in range(len(leasts)):
+        if leasts[m] > radius * radius:
             break
-        cube_x = (x >> 2) + offset[m, 0]
-        cube_y = (y >> 2) + offset[m, 1]
-        cube_z = (z >> 2) + offset[m, 2]
-        observed = _observed_cube(arrays, cube_x, cube_y, cube_z)
-        while observed:
-            bit = lowest_bit(observed)
-            observed &= observed - np.uint64(1)
-            i = CUBE * cube_x + (bit >> 4)
-            j = CUBE * cube_y + ((bit >> 2) & 3)
-            k = CUBE * cube_z + (bit & 3)
+        if presents[m] & ~mask == 0:
+            continue
+        border = borders[m]
+        while border:
+            bit = lowest_bit(border)
+            border &= border - np.uint64(1)
+            i = CUBE * places[m, 0] + (bit >> 4)
+            j = CUBE * places[m, 1] + ((bit >> 2) & 3)
+            k = CUBE * places[m, 2] + (bit & 3)
             if (i - x) ** 2 + (j - y) ** 2 + (k - z) ** 2 <= radius * radius:
-                mask |= _bit_of(_state_at(arrays, i, j, k))
+                mask |= _bit_of(_state_at(arrays[:3], i, j, k))
     return mask
 
 
@@ -259,15 +357,15 @@ def _number_of(palette: U32, mask: np.uint32) -> int:
 @njit(cache=True, nogil=True)
 def _look_up(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
     """The mask of a cell."""
-    mask = arrays[4]
-    i = x - arrays[5][0]
-    j = y - arrays[5][1]
-    k = z - arrays[5][2]
+    mask = arrays[5]
+    i = x - arrays[6][0]
+    j = y - arrays[6][1]
+    k = z - arrays[6][2]
     if i < 0 or j < 0 or k < 0 or i >= mask.shape[0] or j >= mask.shape[1] or k >= mask.shape[2]:
         return NOT_ALIGNED
     if mask[i, j, k] == NOT_MADE:
-        mask[i, j, k] = _number_of(arrays[6], _mask_of(arrays, x, y, z, offsets))
-    return np.uint32(arrays[6][mask[i, j, k]])
+        _make_masks(arrays, (x >> 2, y >> 2, z >> 2), offsets)
+    return np.uint32(arrays[7][mask[i, j, k]])
 
 
 @njit(cache=True, nogil=True)
@@ -277,9 +375,9 @@ def _upper_bounds(
     """Of each of ``shifts`` (m, 3): how many of the voxels may be aligned, -1 below ``least``."""
     out = np.empty(len(shifts), np.int64)
     n = len(cells)
-    mask = arrays[4]
-    low = arrays[5]
-    palette = arrays[6]
+    mask = arrays[5]
+    low = arrays[6]
+    palette = arrays[7]
     cell_numbers = mask.ravel()
     sy = mask.shape[1]
     sz = mask.shape[2]
@@ -318,14 +416,14 @@ def _upper_bounds(
                     possible += (palette[number] & bits[i]) != 0
             else:
                 for i in range(done, end):
-                    mask_of_cell = _look_up(
+                    looked_up = _look_up(
                         arrays,
                         cells[i, 0] + shifts[m, 0],
                         cells[i, 1] + shifts[m, 1],
                         cells[i, 2] + shifts[m, 2],
                         offsets,
                     )
-                    possible += (mask_of_cell & bits[i]) != 0
+                    possible += (looked_up & bits[i]) != 0
             done = end
             if possible + n - done < least:
                 possible = -1
@@ -340,7 +438,7 @@ def _count(arrays: Arrays, points: F64, bits: U32, least: int, offsets: Offsets)
     aligned = 0
     unclear = np.empty(len(points), np.int64)
     left = 0
-    reach = arrays[7]
+    reach = arrays[8]
     for i in range(len(points)):
         x = int(np.floor(points[i, 0]))
         y = int(np.floor(points[i, 1]))
@@ -356,7 +454,7 @@ def _count(arrays: Arrays, points: F64, bits: U32, least: int, offsets: Offsets)
         i = unclear[left]
         point = (points[i, 0], points[i, 1], points[i, 2])
         best, x, y, z = _closest(arrays, point, offsets, reach * reach)
-        if best < reach * reach and _bit_of(_state_at(arrays, x, y, z)) == bits[i]:
+        if best < reach * reach and _bit_of(_state_at(arrays[:3], x, y, z)) == bits[i]:
             aligned += 1
     return aligned if aligned + left >= least else -1
 
@@ -367,7 +465,7 @@ def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I6
     rows = np.empty(len(points), np.int64)
     centres = np.empty((len(points), 3))
     count = 0
-    reach = arrays[7]
+    reach = arrays[8]
     for i in range(len(points)):
         x = int(np.floor(points[i, 0]))
         y = int(np.floor(points[i, 1]))
@@ -375,11 +473,10 @@ def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I6
         mask = _look_up(arrays, x, y, z, offsets)
         if not mask & bits[i]:
             continue
-        if _state_at(arrays, x, y, z) == UNOBSERVED_STATE or reach <= HALF_DIAGONAL:
-            point = (points[i, 0], points[i, 1], points[i, 2])
-            best, x, y, z = _closest(arrays, point, offsets, reach * reach)
-            if best >= reach * reach or _bit_of(_state_at(arrays, x, y, z)) != bits[i]:
-                continue
+        point = (points[i, 0], points[i, 1], points[i, 2])
+        best, x, y, z = _closest(arrays, point, offsets, reach * reach)
+        if best >= reach * reach or _bit_of(_state_at(arrays[:3], x, y, z)) != bits[i]:
+            continue
         rows[count] = i
         centres[count, 0] = x + 0.5
         centres[count, 1] = y + 0.5
@@ -409,6 +506,12 @@ def query_voxels(occupied: tuple[NDArray[np.int32], U8]) -> Voxels:
     parts = -(-len(order) // CHUNK)
     order = np.concatenate([order[part::parts] for part in range(parts)]) if parts else order
     return Voxels(ijk[order].astype(np.float64) + 0.5, class_bit(label)[order])
+
+
+def mask_of_cell(target: OverlapMap, cell: tuple[int, int, int]) -> int:
+    """The bits of all voxels that may be closest to a point in the cell."""
+    x, y, z = cell
+    return int(_look_up(target.arrays, x, y, z, cube_offsets(target.reach + 2)))
 
 
 def overlap(target: OverlapMap, query: Voxels, target_T_query: F64) -> float:

@@ -9,9 +9,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.overlaps import (
+    NOT_ALIGNED,
     Shifts,
     aligned_pairs,
     best_overlaps,
+    class_bit,
+    mask_of_cell,
     overlap,
     overlap_map,
     query_voxels,
@@ -122,6 +125,21 @@ def test_it_equals_the_slow_one(
     assert overlap(overlap_map(blocks, reach), query_voxels(occupied), pose) == slow
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+def test_a_voxel_within_others_is_closest_to_points_in_it(is_full: bool) -> None:
+    """Road within a wall: it is not at the border of what was observed."""
+    voxels = {tuple(ijk): WALL for ijk in np.argwhere(np.ones((5, 5, 5))).tolist()}
+    target = overlap_map(blocks_of(voxels | {(2, 2, 2): ROAD}), 3.0)
+    if is_full:  # the palette has no room for masks, so that every voxel is looked for
+        target.palette[2:] = 1 << 30
+    road = query_voxels(query((2, 2, 2, ROAD)))
+    assert overlap(target, road, shifted(0.4, -0.4, 0.4)) == 1.0
+    assert overlap(target, road, shifted(0.6)) == 0.0
+    ours, theirs = aligned_pairs(target, road, shifted(0.4))
+    np.testing.assert_array_equal(ours, [[2.5, 2.5, 2.5]])
+    np.testing.assert_array_equal(theirs, [[2.5, 2.5, 2.5]])
+
+
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000), most=st.sampled_from([1, 7, 400]))
 def test_the_best_of_many_are_the_best_by_the_slow_one(seed: int, most: int) -> None:
@@ -173,3 +191,37 @@ def test_voxels_that_leave_the_map_do_not_hide_the_others(axis: int) -> None:
         0.4,
     )
     assert [ranked.tau for ranked in found] == [0.5]
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 10_000), reach=st.sampled_from([1.3, 4.0, 10.0]))
+def test_masks_have_every_class_that_may_be_closest(seed: int, reach: float) -> None:
+    blocks = random_map(seed)
+    target = overlap_map(blocks, reach)
+    low, high = blocks.bounds()
+    dense = blocks.dense(low, tuple((high - low).tolist()))
+    seen = dense != UNOBSERVED_STATE
+    beside = np.pad(~seen, 1, constant_values=True)
+    border = seen & np.logical_or.reduce(
+        [np.roll(beside, step, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for step in (1, -1)]
+    )
+    place = np.argwhere(border) + low
+    bits = bits_of(dense[border])
+    corner = np.sqrt(0.75)  # a point of a cell is at most as far from its middle
+    rng = np.random.default_rng(seed)
+    for cell in rng.integers(low - 12, high + 12, (200, 3)):
+        away = np.linalg.norm(place - cell, axis=1)
+        may_be = (away <= away.min() + 2 * corner + 1e-6) & (away <= reach + corner)
+        expected = np.bitwise_or.reduce(bits[may_be], initial=np.uint32(0))
+        if away.min() + corner >= reach:
+            expected |= NOT_ALIGNED
+        inside = tuple((cell - low).tolist())
+        if min(inside) >= 0 and (inside < high - low).all() and seen[inside]:
+            expected = bits_of(dense[inside])
+        assert mask_of_cell(target, tuple(cell.tolist())) == expected
+
+
+def bits_of(state: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """The bits of voxel states."""
+    is_free = state == FREE_STATE
+    return np.where(is_free, NOT_ALIGNED, class_bit(np.where(is_free, ROAD, state)))
