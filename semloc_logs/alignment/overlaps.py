@@ -212,7 +212,7 @@ def _closest(
     y = int(np.floor(point[1]))
     z = int(np.floor(point[2]))
     if _state_at(arrays[:3], x, y, z) != UNOBSERVED_STATE:
-        # no other centre is as close as that of the voxel that a point lies in
+        # of the voxel that a point lies in the centre is the closest
         own = (point[0] - x - 0.5) ** 2 + (point[1] - y - 0.5) ** 2 + (point[2] - z - 0.5) ** 2
         return min(own, bound), x, y, z
     cx = x >> 2
