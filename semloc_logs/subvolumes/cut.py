@@ -25,6 +25,11 @@ CLASSES = {"semantic": 19, "geometric": 1}
 U8 = NDArray[np.uint8]
 
 
+def plain_name(variant: str) -> str:
+    """The name of the shipped files of the paper's method, weights and words."""
+    return f"paper_{variant}"
+
+
 def code_table(variant: str) -> U8:
     """Voxel state (0..255) -> network code.
 

@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.subvolumes.cut import SIZE, code_table
+from semloc_logs.subvolumes.cut import SIZE, code_table, plain_name
 from semloc_logs.subvolumes.describe import Described
 from semloc_logs.subvolumes.plain_network import PlainEncoder
 from semloc_logs.subvolumes.weight_files import load_weights, weights_file
@@ -30,7 +30,7 @@ def load_plain_encoder(variant: str, weights: Path | None = None) -> PlainEncode
     """The encoder of a file, or the shipped one; SettingsError when the file does not hold one of
     the paper's network.
     """
-    with weights_file(f"paper_{variant}", weights) as path:
+    with weights_file(plain_name(variant), weights) as path:
         encoder = load_weights(PlainEncoder, "encoder.", variant, path)
     torch.set_num_threads(1)
     return encoder

@@ -19,6 +19,7 @@ from semloc_logs.engines import Engine
 from semloc_logs.engines.streamed import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved, Training
+from semloc_logs.subvolumes.cut import plain_name
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.plain_describe import load_plain_encoder
 from semloc_logs.subvolumes.weight_files import samples_of, save_weights
@@ -253,7 +254,7 @@ def _words_card(
     settings: Resolved, shards: Sequence[Path], variant: str, descriptors: int
 ) -> dict[str, str]:
     """The origin of words: the samples are those that their weights have seen."""
-    name = f"paper_{variant}" if settings.training.method == "paper" else variant
+    name = plain_name(variant) if settings.training.method == "paper" else variant
     samples = samples_of(name, settings.descriptor.weights)
     facts = {"variant": variant, "descriptors": descriptors, "samples": samples or "unknown"}
     return _card(settings, len(shards), **facts)

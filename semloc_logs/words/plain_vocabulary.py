@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from semloc_logs.errors import SettingsError
+from semloc_logs.subvolumes.cut import plain_name
 from semloc_logs.words.vocabulary import (
     Vocabulary,
     cells_of,
@@ -83,7 +84,7 @@ def load_plain_vocabulary(variant: str, path: Path | None = None) -> PlainVocabu
     """The vocabulary of a file, or the shipped one; SettingsError when the file does not hold one
     of the paper's method.
     """
-    shipped = files("semloc_logs.words") / "vocabularies" / f"paper_{variant}.safetensors"
+    shipped = files("semloc_logs.words") / "vocabularies" / f"{plain_name(variant)}.safetensors"
     with nullcontext(path) if path is not None else as_file(shipped) as file:
         vocabulary = load_vocabulary(variant, file)
         try:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from semloc_logs.subvolumes.cut import SIZE, code_table
+from semloc_logs.subvolumes.cut import SIZE, code_table, plain_name
 from semloc_logs.subvolumes.plain_describe import (
     TILE,
     describe_blocks,
@@ -116,7 +116,7 @@ def test_shipped_weights_and_words_go_together_and_state_their_samples(variant: 
     page = Path(__file__).parents[2] / "docs" / "explanation" / "plain_method.md"
     folder = files("semloc_logs.subvolumes") / "weights"
     with (
-        as_file(folder / f"paper_{variant}.safetensors") as path,
+        as_file(folder / f"{plain_name(variant)}.safetensors") as path,
         safe_open(path, "np") as handle,
     ):
         samples = int(handle.metadata()["samples"])
