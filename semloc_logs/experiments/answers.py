@@ -4,10 +4,9 @@ and new measures need no new run.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from semloc_logs import progress
 from semloc_logs.errors import SemlocError, WorkspaceError
+from semloc_logs.experiments.kept_files import Spent, cpu_seconds, measured
 from semloc_logs.experiments.scenarios import PlannedQuery, Scenario, Trial, query_views
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, System
 from semloc_logs.experiments.views import ViewStore
@@ -50,12 +50,6 @@ class Run:
         return answers / f"system={self.system}" / name
 
 
-def cpu_seconds() -> float:
-    """CPU time of this process and of the children that have ended."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
-
-
 @dataclass(eq=False)
 class Learner:
     """Systems that ``make`` makes, fitted to databases of a ``store``.
@@ -69,17 +63,17 @@ class Learner:
     def __post_init__(self) -> None:
         self._latest: tuple[bytes, System] | None = None
 
-    def fitted(self, database: NDArray[np.int64]) -> tuple[System, float]:
-        """The system that has learnt the views of these numbers, and the CPU time that it took."""
+    def fitted(self, database: NDArray[np.int64]) -> tuple[System, Spent]:
+        """The system that has learnt the views of these numbers, and the CPU time that took now."""
         key = database.tobytes()
         if self._latest is not None and self._latest[0] == key:
-            return self._latest[1], 0.0
+            return self._latest[1], Spent()
         self._latest = None  # two of them may not fit into memory
-        started = cpu_seconds()
-        system = self.make()
-        system.fit(self.store.selection(database))
+        with measured() as spent:
+            system = self.make()
+            system.fit(self.store.selection(database))
         self._latest = (key, system)
-        return system, cpu_seconds() - started
+        return system, spent
 
 
 def answer_scenario(run: Run, scenario: Scenario, learner: Learner, answers: Path) -> int:
@@ -98,7 +92,7 @@ def answer_scenario(run: Run, scenario: Scenario, learner: Learner, answers: Pat
         left = parts.left()
         done += len(trial.queries) - len(left)
         if left:
-            system, parts.fit_cpu_s = learner.fitted(trial.database)
+            system, parts.fit = learner.fitted(trial.database)
             name = f"{run.system}, {run.sensor} {scenario.name}"
             try:
                 for query in left:
@@ -142,7 +136,7 @@ class _Parts:
     trial: Trial
     store: ViewStore
     folder: Path
-    fit_cpu_s: float = 0.0
+    fit: Spent = field(default_factory=Spent)
 
     def __post_init__(self) -> None:
         self._rows: list[tuple[PlannedQuery, _Answered]] = []
@@ -188,11 +182,12 @@ class _Parts:
         metadata = {
             "schema_version": 1,
             "made_from": self._made_from,
-            "fit_cpu_s": self.fit_cpu_s,
+            "fit_cpu_s": self.fit.cpu_s,
+            "kept_cpu_s": self.fit.kept_s,
             "database_views": len(self.trial.database),
         }
         write_table(path, self._table(), metadata, _SORTING)
-        self.fit_cpu_s = 0.0
+        self.fit = Spent()
         self._rows = []
         self._last = time.monotonic()
 
@@ -259,7 +254,7 @@ class Answers:
 
     ``errors_m``, ``errors_deg`` (q, r) are infinite, ``score`` (q, r) is -inf and ``positions`` (q,
     r, 3) are NaN where a pose is missing. ``truth`` (q, 3) are the true positions, ``trial`` (q,)
-    names of trials, ``passage`` (q,), ``cpu_s`` (q,); ``fit_cpu_s`` in all.
+    names of trials, ``passage`` (q,), ``cpu_s`` (q,); ``fit`` is the time of the databases.
     """
 
     queries: list[str]
@@ -271,7 +266,7 @@ class Answers:
     trial: list[str]
     passage: NDArray[np.int64]
     cpu_s: F64
-    fit_cpu_s: float
+    fit: Spent = field(default_factory=Spent)
 
     def __len__(self) -> int:
         return len(self.queries)
@@ -295,15 +290,17 @@ def read_answers(run: Run, scenario: Scenario, answers: Path) -> Answers:
     """The answers of a run so far, in the order of their names."""
     folder = run.folder(answers, scenario)
     tables: list[pa.Table] = []
-    fits = 0.0
+    fit = Spent()
     for trial in scenario.trials:
         for path in _files(folder, trial.name):
             tables.append(read_table(path))
-            fits += float(read_metadata(path)["fit_cpu_s"])
-    return answers_of(tables, fits)
+            metadata = read_metadata(path)
+            fit.cpu_s += float(metadata["fit_cpu_s"])
+            fit.kept_s |= metadata.get("kept_cpu_s", {})
+    return answers_of(tables, fit)
 
 
-def answers_of(tables: Sequence[pa.Table], fit_cpu_s: float = 0.0) -> Answers:
+def answers_of(tables: Sequence[pa.Table], fit: Spent | None = None) -> Answers:
     """The answers in ``tables`` of one system and scenario."""
     table = pa.concat_tables([contracts.schema(TABLE).empty_table(), *tables])
     names = table["query"].to_pylist()
@@ -333,7 +330,7 @@ def answers_of(tables: Sequence[pa.Table], fit_cpu_s: float = 0.0) -> Answers:
         trial=trial,
         passage=_by_query(table, "passage", at, count).astype(np.int64),
         cpu_s=_by_query(table, "cpu_s", at, count),
-        fit_cpu_s=fit_cpu_s,
+        fit=fit or Spent(),
     )
 
 

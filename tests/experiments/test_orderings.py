@@ -35,7 +35,6 @@ def answers(share: float, rank: int = 1) -> Answers:
         trial=["000"] * QUERIES,
         passage=np.arange(QUERIES),
         cpu_s=np.zeros(QUERIES),
-        fit_cpu_s=0.0,
     )
 
 

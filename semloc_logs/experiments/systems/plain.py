@@ -27,6 +27,7 @@ from semloc_logs.alignment.overlaps import (
     overlap_map,
     query_voxels,
 )
+from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
 from semloc_logs.experiments.system_version import module_version
 from semloc_logs.experiments.view_sessions import sensor_centre
@@ -41,7 +42,6 @@ from semloc_logs.subvolumes.plain_describe import (
     load_plain_encoder,
 )
 from semloc_logs.subvolumes.plain_network import PlainEncoder
-from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.plain_vocabulary import (
@@ -121,9 +121,12 @@ class Plain:
         """``word`` and ``code`` (n,) of all occupied subvolumes of a map, and their ``centre`` (n,
         3) in voxels.
         """
-        path = None if self.kept is None else self.kept / f"{self._key(fused)}.safetensors"
-        if path is not None and path.exists():
-            return load_file(path)
+        if self.kept is None:
+            return self._describe(fused)
+        path = self.kept / f"{self._key(fused)}.safetensors"
+        return load_file(kept_file(path, lambda new: save_file(self._describe(fused), new)))
+
+    def _describe(self, fused: _Map) -> dict[str, NDArray[Any]]:
         plain = self.settings.plain
         described = describe_blocks(
             fused.blocks,
@@ -134,12 +137,7 @@ class Plain:
         )
         words = self._vocabulary()
         word, code = words.vocabulary.words(words.lifted(described.descriptor))
-        found: dict[str, NDArray[Any]] = {"word": word, "code": code, "centre": described.centre}
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing_file(path) as temporary:
-                save_file(found, temporary)
-        return found
+        return {"word": word, "code": code, "centre": described.centre}
 
     def _key(self, fused: _Map) -> str:
         """What the words of a map depend on, as a name."""

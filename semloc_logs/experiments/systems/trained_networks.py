@@ -12,8 +12,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import View
-from semloc_logs.tables.atomic_files import replacing_file
 
 KEYED = 64  # views that a key is made of: reading all of them takes long
 
@@ -33,17 +33,20 @@ def trained(path: Path, network: nn.Module, train: Callable[[], None]) -> None:
     Training begins with the same random weights every time.
     """
     torch.set_num_threads(1)
-    try:
-        network.load_state_dict(load_file(path))
-    except (OSError, SafetensorError, RuntimeError):
+
+    def make(temporary: Path) -> None:
         network.train()
         torch.manual_seed(0)
         network.apply(_begin_anew)
         train()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing_file(path) as temporary:
-            weights = {name: value.contiguous() for name, value in network.state_dict().items()}
-            save_file(weights, temporary)
+        weights = {name: value.contiguous() for name, value in network.state_dict().items()}
+        save_file(weights, temporary)
+
+    try:
+        network.load_state_dict(load_file(kept_file(path, make)))
+    except (SafetensorError, RuntimeError):  # damaged, or of another network
+        path.unlink()
+        network.load_state_dict(load_file(kept_file(path, make)))
     network.eval()
 
 

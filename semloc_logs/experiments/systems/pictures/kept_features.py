@@ -9,31 +9,35 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.experiments.kept_files import kept_file
+from semloc_logs.experiments.system import Picture
 from semloc_logs.experiments.system_version import module_version
-from semloc_logs.experiments.systems.pictures import local_features
+from semloc_logs.experiments.systems.pictures import local_features, picture_pose
 from semloc_logs.experiments.systems.pictures.local_features import Features
-from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.experiments.systems.pictures.picture_pose import points_of
 
 U8 = NDArray[np.uint8]
 Extract = Callable[[U8], Features]  # a function with a name of its own
 
 
-def kept_features(extract: Extract, folder: Path) -> Extract:
-    """The same as ``extract``, with a file for each picture (h, w, 3) in ``folder``.
+def kept_features(extract: Extract, folder: Path) -> Callable[[Picture], Path]:
+    """A function from a picture to the file in ``folder`` with its features by ``extract`` and
+    their points (n, 3), base frame, NaN where the depth is unknown.
 
-    Files are of the code of the features: other code makes others.
+    Files are of the code of the features and points: other code makes others.
     """
-    version = module_version(local_features.__name__)
+    version = [module_version(module.__name__) for module in (local_features, picture_pose)]
 
-    def features(image: U8) -> Features:
-        key = hashlib.sha256(repr((extract.__name__, version, image.shape)).encode())
-        key.update(np.ascontiguousarray(image).tobytes())
-        path = folder / f"{key.hexdigest()[:24]}.npz"
-        if not path.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            with replacing_file(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, *extract(image))
-        with np.load(path) as arrays:
-            return Features(*(arrays[name] for name in arrays.files))
+    def file(picture: Picture) -> Path:
+        def make(temporary: Path) -> None:
+            features = extract(picture.image)
+            with temporary.open("wb") as stream:
+                np.savez(stream, *features, points_of(picture, features.xy))
 
-    return features
+        key = hashlib.sha256(repr((extract.__name__, version)).encode())
+        for part in picture:
+            key.update(repr((part.shape, part.dtype)).encode())
+            key.update(np.ascontiguousarray(part).tobytes())
+        return kept_file(folder / f"{key.hexdigest()[:24]}.npz", make)
+
+    return file

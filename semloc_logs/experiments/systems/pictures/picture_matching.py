@@ -4,7 +4,6 @@ and the pose from 2D-3D matches with each of them.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,6 @@ from semloc_logs.experiments.systems.pictures.local_features import Features, un
 from semloc_logs.experiments.systems.pictures.picture_pose import (
     base_pose,
     mutual_matches,
-    points_of,
     pose_of_points,
     two_view_inliers,
 )
@@ -36,8 +34,8 @@ LEAST_FEATURES = 256  # that a vocabulary needs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredPicture:
-    """A picture of the database: the file of its features, its ``view`` of the ``database``, and
-    where the vehicle was.
+    """A picture of the database: the file of its features and points, its ``view`` of the
+    ``database``, and where the vehicle was.
     """
 
     path: Path
@@ -107,8 +105,8 @@ class WordRetrieval:
 class PictureSystem:
     """Features by ``extract``, candidates by ``retrieval``, poses by the points of their depth.
 
-    Features of the database lie in files, so that memory does not grow with them; the features of
-    each picture stay in ``folder`` for other databases.
+    Features of the database lie in files of ``folder``, also for other databases, so that memory
+    does not grow with them.
     """
 
     def __init__(self, name: str, extract: Extract, retrieval: Retrieval, folder: Path) -> None:
@@ -116,7 +114,6 @@ class PictureSystem:
         self._extract = extract
         self._kept = kept_features(extract, folder / "features")
         self._retrieval = retrieval
-        self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._stored: list[StoredPicture] = []
 
     def fit(self, database: Sequence[View]) -> None:
@@ -125,9 +122,7 @@ class PictureSystem:
             view = database[number]
             if view.picture is None:
                 continue
-            features = self._kept(view.picture.image)
-            path = Path(self._folder.name) / f"{number:06d}.npz"
-            np.savez(path, *features, points_of(view.picture, features.xy))
+            path = self._kept(view.picture)
             self._stored.append(StoredPicture(path, database, number, view.world_T_base))
         self._retrieval.fit(self._stored)
 

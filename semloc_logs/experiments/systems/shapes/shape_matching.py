@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, query_map
 from semloc_logs.experiments.systems.shapes.training_views import Training
@@ -98,15 +99,16 @@ class ShapeSystem:
     def _vocabulary(self) -> Vocabulary:
         """The words of the descriptor: read from the folder, or learnt."""
         key = f"{self._training.key}-{self._settings.fingerprint('fusion')}"
-        path = self._folder / f"{self.name}-words-{key}.safetensors"
-        if not path.exists():
+
+        def make(temporary: Path) -> None:
             trained_on = database_map(self._training.views(), self._settings)
             words = unit_vectors(self._descriptor.describe(trained_on, 0.0).descriptor)
             rng = np.random.default_rng(0)
             some = np.sort(rng.permutation(len(words))[:TRAINING_KEYPOINTS])
-            self._folder.mkdir(parents=True, exist_ok=True)
-            save_vocabulary(path, train_vocabulary(words[some]), {"training": key})
-        return load_vocabulary(self.name, path)
+            save_vocabulary(temporary, train_vocabulary(words[some]), {"training": key})
+
+        path = self._folder / f"{self.name}-words-{key}.safetensors"
+        return load_vocabulary(self.name, kept_file(path, make))
 
     def localise(self, query: Query) -> list[RankedPose]:
         if self._index is None:

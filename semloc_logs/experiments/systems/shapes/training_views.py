@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
+from semloc_logs.experiments.kept_files import not_counted
 from semloc_logs.experiments.system import View
 from semloc_logs.training.training_scenes import TrainingFrame, training_scene
 
@@ -34,11 +35,12 @@ def simulated_training(*, quick: bool) -> Training:
 @lru_cache(maxsize=1)
 def training_views(scenes: int, frames: int) -> tuple[View, ...]:
     """The mapping drives of so many scenes, of about ``frames`` views each, far from each other."""
-    return tuple(
-        _view(seed, number, frame)
-        for seed in STREETS[:scenes]
-        for number, frame in enumerate(training_scene(seed, frames).mapped)
-    )
+    with not_counted():
+        return tuple(
+            _view(seed, number, frame)
+            for seed in STREETS[:scenes]
+            for number, frame in enumerate(training_scene(seed, frames).mapped)
+        )
 
 
 def _view(seed: int, number: int, frame: TrainingFrame) -> View:
