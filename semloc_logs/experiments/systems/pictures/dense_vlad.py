@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.pictures.local_features import Features, dense_sift, dsp_sift
+from semloc_logs.experiments.systems.pictures.local_features import (
+    DENSE_STEP,
+    Features,
+    dense_sift,
+    dsp_sift,
+)
 from semloc_logs.experiments.systems.pictures.picture_matching import PictureSystem, StoredPicture
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 
@@ -24,12 +29,14 @@ WORDS = 128
 DIMENSIONS = 4096
 TRAINING_FEATURES = 200_000  # that the words are made of, at most
 ROUNDS = 20
+QUICK_STEP = 2 * DENSE_STEP  # pixels between features in a small scene: a quarter of them
 
 
 class DenseVlad:
-    """The vectors of the database's pictures."""
+    """The vectors of the database's pictures, of features every ``step`` pixels."""
 
-    def __init__(self) -> None:
+    def __init__(self, step: int = DENSE_STEP) -> None:
+        self._step = step
         self._words = np.zeros((0, 128), np.float32)
         self._mean = np.zeros(0, np.float32)
         self._axes = np.zeros((0, 0), np.float32)
@@ -43,7 +50,7 @@ class DenseVlad:
         share = max(1, TRAINING_FEATURES // len(pictures))
         parts = []
         for stored in pictures:
-            features = dense_sift(stored.image())
+            features = dense_sift(stored.image(), self._step)
             rows = rng.permutation(len(features.xy))[:share]
             parts.append(features.vectors()[rows])
         training = np.concatenate(parts)
@@ -59,7 +66,7 @@ class DenseVlad:
         return np.asarray(self._vectors @ self._projected(self._vlad(image)[None])[0], np.float64)
 
     def _vlad(self, image: U8) -> F32:
-        descriptors = grid(dense_sift(image).vectors())
+        descriptors = grid(dense_sift(image, self._step).vectors())
         word, _ = nearest_centroids(descriptors, self._words)
         out = np.zeros_like(self._words)
         np.add.at(out, word, descriptors - self._words[word])
@@ -86,4 +93,5 @@ def _unit(rows: F32) -> F32:
 
 def make_dense_vlad(options: SystemOptions) -> PictureSystem:
     """DenseVLAD in place of the visual words."""
-    return PictureSystem("dense-vlad", dsp_sift, DenseVlad(), options.folder)
+    retrieval = DenseVlad(QUICK_STEP if options.quick else DENSE_STEP)
+    return PictureSystem("dense-vlad", dsp_sift, retrieval, options.folder)
