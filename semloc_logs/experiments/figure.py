@@ -23,6 +23,7 @@ from semloc_logs.tables.atomic_files import replacing_file
 
 _MOST_ERROR_M = 10.0  # of the error curves
 _PANEL_IN = 2.1  # inches
+_ROWS = 3  # panels of a scenario by heading above each other
 _COLOURS = 10  # of matplotlib's cycle; then the next style of lines
 _STYLES = ("-", "--", ":", "-.")
 
@@ -36,7 +37,7 @@ def draw_figure(outcome: Outcome, sensor: str, path: Path) -> None:
     queries = list(dict.fromkeys(s.name.partition(">")[2] for s in matrix))
     rows_of_matrix = len(maps)
     width = _PANEL_IN * (len(headings) + len(queries) + 0.5)
-    height = _PANEL_IN * max(3, rows_of_matrix) + 1.2
+    height = _PANEL_IN * max(_ROWS, rows_of_matrix) + 1.2
     figure = Figure(figsize=(max(width, 5.0), height), layout="constrained")
     grid = figure.add_gridspec(
         1, 2, width_ratios=[max(1, len(headings)), max(0.01, len(queries))], wspace=0.02
@@ -44,11 +45,12 @@ def draw_figure(outcome: Outcome, sensor: str, path: Path) -> None:
     shown = [row for row in outcome.rows if any(s == sensor for s, _ in row.answers)]
     if headings:
         part = figure.add_subfigure(grid[0, 0])
-        _draw_headings(part.subplots(3, len(headings), squeeze=False), headings, shown, sensor)
+        _draw_headings(part.subplots(_ROWS, len(headings), squeeze=False), headings, shown, sensor)
         part.suptitle("viewpoint", fontsize=10)
     if matrix:
         part = figure.add_subfigure(grid[0, 1])
-        axes = part.subplots(rows_of_matrix, len(queries), squeeze=False)
+        # a small matrix has panels of the same height
+        axes = part.subplots(max(_ROWS, rows_of_matrix), len(queries), squeeze=False)
         _draw_matrix(axes, maps, queries, matrix, shown, sensor)
         part.suptitle("time (row: database, column: query)", fontsize=10)
     handles = [Line2D([], [], label=row.title, **_style(k)) for k, row in enumerate(shown)]
@@ -69,7 +71,7 @@ def _draw_headings(
 ) -> None:
     for column, scenario in enumerate(scenarios):
         top, first, second = axes[:, column]
-        top.set_title(f"{scenario.name}°", fontsize=9)
+        top.set_title(f"{scenario.name}° ({_counted(scenario)})", fontsize=9)
         _errors(top, rows, sensor, scenario.name)
         for panel, threshold in ((first, THRESHOLDS_M[0]), (second, THRESHOLDS_M[1])):
             _ranks(panel, rows, sensor, scenario.name, threshold)
@@ -87,7 +89,10 @@ def _draw_matrix(
     rows: Sequence[Row],
     sensor: str,
 ) -> None:
-    known = {scenario.name for scenario in scenarios}
+    known = {scenario.name: scenario for scenario in scenarios}
+    for row in axes[len(maps) :]:
+        for panel in row:
+            panel.set_axis_off()
     for i, database in enumerate(maps):
         for j, query in enumerate(queries):
             panel = axes[i, j]
@@ -96,12 +101,17 @@ def _draw_matrix(
                 panel.set_axis_off()
                 continue
             _errors(panel, rows, sensor, name)
-            if i == 0:
-                panel.set_title(query, fontsize=9)
+            title = _counted(known[name])
+            panel.set_title(f"{query} ({title})" if i == 0 else title, fontsize=9)
             if j == 0:
                 panel.set_ylabel(f"{database}: localised", fontsize=8)
             if i < len(maps) - 1:
                 panel.set_xlabel("")
+
+
+def _counted(scenario: Scenario) -> str:
+    count = len(scenario.queries)
+    return f"{count} {'query' if count == 1 else 'queries'}"
 
 
 def _errors(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str) -> None:

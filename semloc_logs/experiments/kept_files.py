@@ -51,7 +51,7 @@ def measured() -> Iterator[Spent]:
 
 @contextmanager
 def not_counted() -> Iterator[None]:
-    """A block that is no work of a system: the simulation of what it learns from."""
+    """A block that does not count to a system: the simulation of what it learns from."""
     with measured() as inner:
         yield
     _add_apart(inner.cpu_s + inner.apart_s)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.experiments.answers import Answers
 from semloc_logs.experiments.measures import (
+    FEWEST_PASSAGES,
     THRESHOLDS_M,
     Bounded,
     PrecisionRecall,
@@ -42,6 +44,15 @@ TIME = (
     "Kept files are networks, words and features of pictures, made once for all databases. They"
     " count to every system that uses them, so that a row has what the system would take alone. The"
     " simulation of the streets that networks and words are learnt from counts to none."
+)
+COLUMNS = (
+    "A column is a sensor and a scenario: the angle in degrees between the headings of the queries"
+    " and of the database's views, or the conditions of the map and of the queries. Shares have"
+    f" 95 % bounds over passages; of fewer than {FEWEST_PASSAGES} passages the queries are counted."
+)
+SMALL = (
+    f"Every scenario has fewer than {FEWEST_PASSAGES} passages: this run shows that the systems"
+    " work, and not how well. No ordering of the paper can be decided by it."
 )
 RANKS = (1, 5, 20, MOST_POSES)  # of the tables; the curves have all
 ALLOWED_FDR = 0.05  # share of wrong answers that an abstaining system may give
@@ -96,6 +107,14 @@ class Outcome:
             for scenario in scenarios
             if scenario.trials
         ]
+
+    def passages(self) -> dict[tuple[str, str], int]:
+        """The passages of every column."""
+        return {
+            (sensor, scenario.name): len({query.passage for query in scenario.queries})
+            for sensor, scenarios in self.scenarios.items()
+            for scenario in scenarios
+        }
 
 
 def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[str, Any]:
@@ -251,20 +270,33 @@ def _number(value: float) -> float | None:
 def to_markdown(outcome: Outcome) -> str:
     """The tables of a run, hypotheses and remarks."""
     columns = outcome.columns()
-    parts = ["# Experiments of the paper"]
+    passages = outcome.passages()
+    is_small = all(passages[column] < FEWEST_PASSAGES for column in columns)
+    parts = ["# Experiments of the paper", *([SMALL] if is_small else []), COLUMNS]
+    shares = []
     for threshold in THRESHOLDS_M:
         for rank, title in ((1, "first pose"), (MOST_POSES, f"first {MOST_POSES} poses")):
-            parts += [
+            shares += [
                 f"## Localised within {threshold:g} m, {title}",
-                "Share of queries, with 95 % bounds over passages.",
-                _table(outcome, columns, threshold, rank),
+                _table(outcome, partial(_localised, threshold=threshold, rank=rank)),
             ]
-    parts += ["## Time", TIME, _times(outcome), "## Orderings of the paper", _orderings(outcome)]
+    errors = [
+        "## Error of the first pose",
+        "Median, metres; a query without a pose counts as farthest.",
+        _table(outcome, _error),
+    ]
+    # of a few queries the errors tell more than counts
+    parts += [*errors, *shares] if is_small else [*shares, *errors]
+    parts += ["## Time", TIME, _times(outcome)]
+    if not is_small:
+        parts += ["## Orderings of the paper", _orderings(outcome)]
     remarks = [f"- {row.title}: {row.remark}" for row in outcome.rows if row.remark]
+    sensors: dict[tuple[str, str], list[str]] = {}
+    for row in outcome.rows:
+        for sensor, reason in row.not_run.items():
+            sensors.setdefault((row.title, reason), []).append(sensor)
     reasons = [
-        f"- {row.title}, {sensor}: {reason}"
-        for row in outcome.rows
-        for sensor, reason in row.not_run.items()
+        f"- {title}, {', '.join(names)}: {reason}" for (title, reason), names in sensors.items()
     ]
     if remarks:
         parts += ["## Remarks", "\n".join(remarks)]
@@ -273,9 +305,12 @@ def to_markdown(outcome: Outcome) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _table(
-    outcome: Outcome, columns: Sequence[tuple[str, str]], threshold: float, rank: int
-) -> str:
+def _table(outcome: Outcome, cell: Callable[[Answers, bool], str]) -> str:
+    """A row a system and a column a scenario; ``cell`` gets answers and whether the scenario has
+    few passages.
+    """
+    columns = outcome.columns()
+    passages = outcome.passages()
     lines = [_line("", [f"{sensor} {name}" for sensor, name in columns])]
     lines.append(_line("---", ["---"] * len(columns)))
     counts = {
@@ -291,11 +326,23 @@ def _table(
             if answers is None or not len(answers):
                 cells.append("not run" if column[0] in row.not_run else "")
                 continue
-            share = ratio(localised(answers.errors_m, threshold, rank), answers.passage)
             open_ = "" if len(answers) == counts[column] else f" ({len(answers)} queries)"
-            cells.append(f"{_shown(share)}{open_}")
+            cells.append(cell(answers, passages[column] < FEWEST_PASSAGES) + open_)
         lines.append(_line(row.title, cells))
     return "\n".join(lines)
+
+
+def _localised(answers: Answers, is_few: bool, *, threshold: float, rank: int) -> str:
+    right = localised(answers.errors_m, threshold, rank)
+    if is_few:
+        return f"{int(right.sum())} of {len(right)}"
+    return _shown(ratio(right, answers.passage))
+
+
+def _error(answers: Answers, _: bool) -> str:
+    # of an even number the farther one in the middle: the mean of it and no pose would be neither
+    median = float(np.sort(answers.first_m)[len(answers) // 2])
+    return f"{median:.2f}" if math.isfinite(median) else "no pose"
 
 
 def _times(outcome: Outcome) -> str:

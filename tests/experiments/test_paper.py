@@ -92,9 +92,9 @@ def run(
         time_scenario(store, "summer>snow", "map", "snow"),
     ]
 
-    def run_once(*, only_tables: bool = False) -> PaperFiles:
+    def run_once(*, only_tables: bool = False, first: int = 0) -> PaperFiles:
         request = PaperRequest(load().resolved(), tmp_path, only_tables=only_tables)
-        return run_systems(request, ENTRIES, {"lidar": store}, {"lidar": scenarios})
+        return run_systems(request, ENTRIES, {"lidar": store}, {"lidar": scenarios[first:]})
 
     return run_once
 
@@ -105,9 +105,12 @@ def test_the_table_has_a_row_for_every_system(run: Callable[[], PaperFiles]) -> 
     # 3.5 m beside the mapped lane: within 5 m, not within 1 m; in snow 0.5 m
     rows = [line for line in text.splitlines() if line.startswith("| Nearest |")]
     assert rows[0].split("|")[2].strip().startswith("0.00")
-    assert rows[0].split("|")[3].strip().startswith("1.00")
     assert rows[2].split("|")[2].strip().startswith("1.00")
+    # in snow there are two passages only
+    assert rows[0].split("|")[3].strip() == "40 of 40"
+    assert [cell.strip() for cell in rows[4].split("|")[2:4]] == ["3.50", "0.50"]
     assert "| queries | 100 | 40 |" in text
+    assert "Every scenario" not in text
     assert "- Failing, lidar: it failed: ZeroDivisionError: nothing to divide by" in text
     assert (
         "- Missing, lidar: Missing needs a_library_that_nobody_has, which is not installed: "
@@ -118,6 +121,17 @@ def test_the_table_has_a_row_for_every_system(run: Callable[[], PaperFiles]) -> 
     )
     assert "- Nearest: It knows the truth." in text
     assert "| acc. above single | our pipeline | lidar | 90 |  | not measured |" in text
+
+
+def test_a_table_of_few_passages_counts_and_decides_nothing(
+    run: Callable[..., PaperFiles],
+) -> None:
+    files = run(first=1)  # in snow alone
+    text = files.table.read_text()
+    assert "Every scenario has fewer than 5 passages" in text
+    assert "| Nearest | 40 of 40 |" in text
+    assert "Orderings" not in text
+    assert json.loads(files.json.read_text())["findings"]
 
 
 def test_every_measure_is_in_the_json(run: Callable[[], PaperFiles]) -> None:
