@@ -240,7 +240,7 @@ def run_systems(
         for (sensor, scenario), found in row.answers.items()
     }
     rivals = [entry.name for entry in BASELINES]
-    outcome = Outcome(rows, scenarios, stores, findings(known, rivals))
+    outcome = Outcome(rows, scenarios, stores, findings(known, rivals), request.quick)
     return _write(request.folder, outcome)
 
 

@@ -54,6 +54,10 @@ SMALL = (
     f"Every scenario has fewer than {FEWEST_PASSAGES} passages: this run shows that the systems"
     " work, and not how well. No ordering of the paper can be decided by it."
 )
+QUICK = (
+    "A quick run: networks of CGF, 3DMatch, PoseNet and DSAC are trained for a few steps only,"
+    " and cannot be good."
+)
 RANKS = (1, 5, 20, MOST_POSES)  # of the tables; the curves have all
 ALLOWED_FDR = 0.05  # share of wrong answers that an abstaining system may give
 ERRORS_M = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0, 20.0])
@@ -92,12 +96,15 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A whole run: ``rows`` of systems, ``scenarios`` and ``stores`` by sensor, ``findings``."""
+    """A whole run: ``rows`` of systems, ``scenarios`` and ``stores`` by sensor, ``findings``;
+    ``is_quick``: networks are trained for a few steps.
+    """
 
     rows: Sequence[Row]
     scenarios: Mapping[str, Sequence[Scenario]]
     stores: Mapping[str, ViewStore]
     findings: Sequence[Finding]
+    is_quick: bool = False
 
     def columns(self) -> list[tuple[str, str]]:
         """Sensor and name of every scenario that has queries."""
@@ -272,7 +279,11 @@ def to_markdown(outcome: Outcome) -> str:
     columns = outcome.columns()
     passages = outcome.passages()
     is_small = all(passages[column] < FEWEST_PASSAGES for column in columns)
-    parts = ["# Experiments of the paper", *([SMALL] if is_small else []), COLUMNS]
+    warnings = [
+        *([QUICK] if outcome.is_quick else []),
+        *([SMALL] if is_small else []),
+    ]
+    parts = ["# Experiments of the paper", *warnings, COLUMNS]
     shares = []
     for threshold in THRESHOLDS_M:
         for rank, title in ((1, "first pose"), (MOST_POSES, f"first {MOST_POSES} poses")):

@@ -92,8 +92,8 @@ def run(
         time_scenario(store, "summer>snow", "map", "snow"),
     ]
 
-    def run_once(*, only_tables: bool = False, first: int = 0) -> PaperFiles:
-        request = PaperRequest(load().resolved(), tmp_path, only_tables=only_tables)
+    def run_once(*, only_tables: bool = False, first: int = 0, quick: bool = False) -> PaperFiles:
+        request = PaperRequest(load().resolved(), tmp_path, only_tables=only_tables, quick=quick)
         return run_systems(request, ENTRIES, {"lidar": store}, {"lidar": scenarios[first:]})
 
     return run_once
@@ -111,6 +111,7 @@ def test_the_table_has_a_row_for_every_system(run: Callable[[], PaperFiles]) -> 
     assert [cell.strip() for cell in rows[4].split("|")[2:4]] == ["3.50", "0.50"]
     assert "| queries | 100 | 40 |" in text
     assert "Every scenario" not in text
+    assert "A quick run" not in text
     assert "- Failing, lidar: it failed: ZeroDivisionError: nothing to divide by" in text
     assert (
         "- Missing, lidar: Missing needs a_library_that_nobody_has, which is not installed: "
@@ -126,8 +127,9 @@ def test_the_table_has_a_row_for_every_system(run: Callable[[], PaperFiles]) -> 
 def test_a_table_of_few_passages_counts_and_decides_nothing(
     run: Callable[..., PaperFiles],
 ) -> None:
-    files = run(first=1)  # in snow alone
+    files = run(first=1, quick=True)  # in snow alone
     text = files.table.read_text()
+    assert "A quick run: networks" in text
     assert "Every scenario has fewer than 5 passages" in text
     assert "| Nearest | 40 of 40 |" in text
     assert "Orderings" not in text
