@@ -47,6 +47,7 @@ CUBES = BLOCK // CUBE  # along the edge of a block
 # of a map, in the order of its fields
 Arrays = tuple[I32, I64, U8, U64, U32, U8, I64, U32, float]
 Grid = tuple[I32, I64, U8]  # the first three of them
+Borders = tuple[I32, I64, U8, U64]  # the first four; handing on all of them takes longer
 Around = tuple[I64, U64, U32, F64]  # cubes: places, border, bits, squares of least distances
 Offsets = tuple[I64, F64]  # of cubes, and the squares of their least distances
 
@@ -190,28 +191,25 @@ def _cell_of(x: int, y: int, z: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _border_of(arrays: Arrays, x: int, y: int, z: int) -> tuple[np.uint64, np.uint32]:
-    """The border cells of the cube (x, y, z), in cubes, and the bits of their states."""
-    row = _row_of(arrays[0], arrays[1], x << 2, y << 2, z << 2)
-    if row < 0:
-        return np.uint64(0), np.uint32(0)
-    cube = (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)
-    return arrays[3][row, cube], arrays[4][row, cube]
+def _cube_of(x: int, y: int, z: int) -> int:
+    """The number of the cube (x, y, z), in cubes, in its block."""
+    return (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)
 
 
 @njit(cache=True, nogil=True)
 def _closest(
-    arrays: Arrays, point: tuple[float, float, float], offsets: Offsets, bound: float
+    borders: Borders, point: tuple[float, float, float], offsets: Offsets, bound: float
 ) -> tuple[float, int, int, int]:
     """Squared distance and voxel of the observed voxel whose centre is closest to ``point``.
 
     Only those nearer than ``bound`` (squared) count; without one the distance is ``bound``.
     """
+    number, first, state, border = borders
     offset, least = offsets
     x = int(np.floor(point[0]))
     y = int(np.floor(point[1]))
     z = int(np.floor(point[2]))
-    if _state_at(arrays[:3], x, y, z) != UNOBSERVED_STATE:
+    if _state_at((number, first, state), x, y, z) != UNOBSERVED_STATE:
         # of the voxel that a point lies in the centre is the closest
         own = (point[0] - x - 0.5) ** 2 + (point[1] - y - 0.5) ** 2 + (point[2] - z - 0.5) ** 2
         return min(own, bound), x, y, z
@@ -226,10 +224,13 @@ def _closest(
         x = cx + offset[m, 0]
         y = cy + offset[m, 1]
         z = cz + offset[m, 2]
-        border, _ = _border_of(arrays, x, y, z)
-        if border == 0:
+        row = _row_of(number, first, x << 2, y << 2, z << 2)
+        if row < 0:
             continue
-        best, bit = closest_in_cube(border, (x, y, z), point, best)
+        cells = border[row, _cube_of(x, y, z)]
+        if cells == 0:
+            continue
+        best, bit = closest_in_cube(cells, (x, y, z), point, best)
         if bit >= 0:
             found = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
     return best, found[0], found[1], found[2]
@@ -258,6 +259,7 @@ def _make_masks(arrays: Arrays, cube: tuple[int, int, int], offsets: Offsets) ->
     x = CUBE * cube[0]
     y = CUBE * cube[1]
     z = CUBE * cube[2]
+    grid = (number, first, state)
     is_near = _row_of(number, first, x, y, z) >= 0
     around = _cubes_around(arrays, cube, offsets, reach + HALF_DIAGONAL)
     for cell in range(CUBE**3):
@@ -266,13 +268,13 @@ def _make_masks(arrays: Arrays, cube: tuple[int, int, int], offsets: Offsets) ->
         k = z + (cell & 3)
         bits = NOT_ALIGNED
         if is_near:
-            own = _state_at((number, first, state), i, j, k)
+            own = _state_at(grid, i, j, k)
             if own != UNOBSERVED_STATE:
                 bits = _bit_of(own)
                 if reach <= HALF_DIAGONAL:
                     bits |= NOT_ALIGNED
             elif len(around[0]):
-                bits = _mask_of(arrays, (i, j, k), around)
+                bits = _mask_of(grid, reach, (i, j, k), around)
         mask[i - low[0], j - low[1], k - low[2]] = _number_of(palette, bits)
 
 
@@ -281,6 +283,7 @@ def _cubes_around(
     arrays: Arrays, cube: tuple[int, int, int], offsets: Offsets, far: float
 ) -> Around:
     """The cubes with border cells that may lie within ``far`` of a cell's middle in ``cube``."""
+    number, first, _, border, present, _, _, _, _ = arrays
     offset, least = offsets
     places = np.empty((len(offset), 3), np.int64)
     borders = np.empty(len(offset), np.uint64)
@@ -293,23 +296,25 @@ def _cubes_around(
         x = cube[0] + offset[m, 0]
         y = cube[1] + offset[m, 1]
         z = cube[2] + offset[m, 2]
-        border, present = _border_of(arrays, x, y, z)
-        if border:
+        row = _row_of(number, first, x << 2, y << 2, z << 2)
+        if row < 0:
+            continue
+        cells = border[row, _cube_of(x, y, z)]
+        if cells:
             places[count, 0] = x
             places[count, 1] = y
             places[count, 2] = z
-            borders[count] = border
-            presents[count] = present
+            borders[count] = cells
+            presents[count] = present[row, _cube_of(x, y, z)]
             leasts[count] = least[m]
             count += 1
     return places[:count], borders[:count], presents[:count], leasts[:count]
 
 
 @njit(cache=True, nogil=True)
-def _mask_of(arrays: Arrays, cell: tuple[int, int, int], around: Around) -> np.uint32:
+def _mask_of(grid: Grid, reach: float, cell: tuple[int, int, int], around: Around) -> np.uint32:
     """The bits of all voxels of the cubes ``around`` that may be closest to a point in the cell."""
     places, borders, presents, leasts = around
-    reach = arrays[8]
     far = reach + HALF_DIAGONAL
     x, y, z = cell
     middle = (x + 0.5, y + 0.5, z + 0.5)
@@ -338,7 +343,7 @@ def _mask_of(arrays: Arrays, cell: tuple[int, int, int], around: Around) -> np.u
             j = CUBE * places[m, 1] + ((bit >> 2) & 3)
             k = CUBE * places[m, 2] + (bit & 3)
             if (i - x) ** 2 + (j - y) ** 2 + (k - z) ** 2 <= radius * radius:
-                mask |= _bit_of(_state_at(arrays[:3], i, j, k))
+                mask |= _bit_of(_state_at(grid, i, j, k))
     return mask
 
 
@@ -439,11 +444,23 @@ def _count(arrays: Arrays, points: F64, bits: U32, least: int, offsets: Offsets)
     unclear = np.empty(len(points), np.int64)
     left = 0
     reach = arrays[8]
+    numbers = arrays[5]
+    low = arrays[6]
+    palette = arrays[7]
+    nx, ny, nz = numbers.shape
     for i in range(len(points)):
         x = int(np.floor(points[i, 0]))
         y = int(np.floor(points[i, 1]))
         z = int(np.floor(points[i, 2]))
-        mask = _look_up(arrays, x, y, z, offsets)
+        # as _look_up: a call for each point, with all arrays, takes as long as the rest
+        p = x - low[0]
+        q = y - low[1]
+        r = z - low[2]
+        if not (0 <= p < nx and 0 <= q < ny and 0 <= r < nz):
+            continue
+        if numbers[p, q, r] == NOT_MADE:
+            _look_up(arrays, x, y, z, offsets)
+        mask = palette[numbers[p, q, r]]
         if mask == bits[i]:
             aligned += 1
         elif mask & bits[i]:
@@ -453,7 +470,7 @@ def _count(arrays: Arrays, points: F64, bits: U32, least: int, offsets: Offsets)
         left -= 1
         i = unclear[left]
         point = (points[i, 0], points[i, 1], points[i, 2])
-        best, x, y, z = _closest(arrays, point, offsets, reach * reach)
+        best, x, y, z = _closest(arrays[:4], point, offsets, reach * reach)
         if best < reach * reach and _bit_of(_state_at(arrays[:3], x, y, z)) == bits[i]:
             aligned += 1
     return aligned if aligned + left >= least else -1
@@ -474,7 +491,7 @@ def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I6
         if not mask & bits[i]:
             continue
         point = (points[i, 0], points[i, 1], points[i, 2])
-        best, x, y, z = _closest(arrays, point, offsets, reach * reach)
+        best, x, y, z = _closest(arrays[:4], point, offsets, reach * reach)
         if best >= reach * reach or _bit_of(_state_at(arrays[:3], x, y, z)) != bits[i]:
             continue
         rows[count] = i
