@@ -19,7 +19,7 @@ def test_every_entry_makes_the_system_of_its_name(
     entry: Entry, options: Any, tmp_path: Path
 ) -> None:
     try:
-        system = make_system(entry, replace(options, folder=tmp_path))
+        system = make_system(entry, replace(options, folder=tmp_path / entry.name))
     except NotInstalledError as problem:
         assert entry.extra
         pytest.skip(str(problem))

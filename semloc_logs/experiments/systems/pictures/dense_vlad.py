@@ -19,7 +19,11 @@ from semloc_logs.experiments.systems.pictures.local_features import (
     dense_sift,
     dsp_sift,
 )
-from semloc_logs.experiments.systems.pictures.picture_matching import PictureSystem, StoredPicture
+from semloc_logs.experiments.systems.pictures.picture_matching import (
+    PictureSystem,
+    StoredPicture,
+    features_folder,
+)
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 
 U8 = NDArray[np.uint8]
@@ -94,4 +98,4 @@ def _unit(rows: F32) -> F32:
 def make_dense_vlad(options: SystemOptions) -> PictureSystem:
     """DenseVLAD in place of the visual words."""
     retrieval = DenseVlad(QUICK_STEP if options.quick else DENSE_STEP)
-    return PictureSystem("dense-vlad", dsp_sift, retrieval, options.folder)
+    return PictureSystem("dense-vlad", dsp_sift, retrieval, features_folder(options))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
+from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.kept_features import Extract, kept_features
 from semloc_logs.experiments.systems.pictures.local_features import Features, unit_descriptors
 from semloc_logs.experiments.systems.pictures.picture_pose import (
@@ -102,17 +103,22 @@ class WordRetrieval:
         return self._index.scores(features.vectors())
 
 
+def features_folder(options: SystemOptions) -> Path:
+    """The folder of features, which systems share."""
+    return options.folder.parent / "features"
+
+
 class PictureSystem:
     """Features by ``extract``, candidates by ``retrieval``, poses by the points of their depth.
 
-    Features of the database lie in files of ``folder``, also for other databases, so that memory
-    does not grow with them.
+    Features of the database lie in files of ``folder``, also for other databases and systems, so
+    that memory does not grow with them.
     """
 
     def __init__(self, name: str, extract: Extract, retrieval: Retrieval, folder: Path) -> None:
         self.name = name
         self._extract = extract
-        self._kept = kept_features(extract, folder / "features")
+        self._kept = kept_features(extract, folder)
         self._retrieval = retrieval
         self._stored: list[StoredPicture] = []
 

@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import Picture
+from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.kept_features import kept_features
 from semloc_logs.experiments.systems.pictures.local_features import Features, sift
+from semloc_logs.experiments.systems.pictures.picture_matching import features_folder
+from semloc_logs.settings import Settings
 
 
 def test_features_of_a_picture_are_computed_once(tmp_path: Path) -> None:
@@ -41,3 +44,9 @@ def test_features_of_a_picture_are_computed_once(tmp_path: Path) -> None:
             np.testing.assert_allclose(points[:, 0], (xy[:, 0] - 60) / 100 * away, atol=1e-5)
     assert computed == [1, 1, 1]
     assert len([*(tmp_path / "features").glob("*.npz")]) == 3
+
+
+def test_systems_share_their_features(tmp_path: Path) -> None:
+    settings = Settings().resolved()
+    one, other = (SystemOptions(settings, tmp_path / name) for name in ("dsp-sift", "dense-vlad"))
+    assert features_folder(one) == features_folder(other) == tmp_path / "features"
