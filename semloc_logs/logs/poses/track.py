@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semloc_logs.frames import F64, PoseSample, TransformSample
 from semloc_logs.numerics import transforms
 
-EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nearest pose serves
+EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: it goes on as it was
 # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
 PERIODS_PER_GAP = 3.0
 # s; nothing that drives is interpolated over more than this, however slow its stream
@@ -176,7 +176,10 @@ class PoseTrack:
         return self._limit[1]
 
     def at(self, stamp_ns: int) -> F64 | None:
-        """The pose (4, 4) at ``stamp_ns``; None in a gap and over 0.1 s outside of the stream."""
+        """The pose (4, 4) at ``stamp_ns``; None in a gap and over 0.1 s outside of the stream.
+
+        Outside it the motion goes on as it was: at 10 m/s the nearest pose is off by up to a metre.
+        """
         if not is_time(stamp_ns):
             return None
         poses, known = self.at_many(np.array([stamp_ns], np.int64))
@@ -189,12 +192,28 @@ class PoseTrack:
         if self._n == 0:
             return poses, np.zeros(len(wanted), bool)
         stamps = self.stamps_ns
+        known = (wanted >= stamps[0] - EDGE_NS) & (wanted <= stamps[-1] + EDGE_NS)
+        poses, is_within = self._within(np.clip(wanted, stamps[0], stamps[-1]))
+        known &= is_within
+        for end, is_beyond in ((0, wanted < stamps[0]), (-1, wanted > stamps[-1])):
+            rows = np.flatnonzero(known & is_beyond)
+            mirrored = 2 * stamps[end] - wanted[rows]
+            before, is_near = self._within(mirrored)
+            rows = rows[is_near]
+            # as far beyond the end as the motion was before it
+            poses[rows] = poses[rows] @ transforms.inverse(before[is_near]) @ poses[rows]
+        return poses, known
+
+    def _within(self, wanted: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
+        """Poses (m, 4, 4) at stamps (m,) between the ends, and which are not in gaps or outside."""
+        poses = np.tile(np.eye(4), (len(wanted), 1, 1))
+        stamps = self.stamps_ns
         newest = self._n - 1
         right = np.searchsorted(stamps, wanted, side="left")
         is_exact = stamps[np.minimum(right, newest)] == wanted
         left = np.clip(np.where(is_exact, right, right - 1), 0, newest)
         right = np.clip(right, 0, newest)
-        known = (wanted >= stamps[0] - EDGE_NS) & (wanted <= stamps[-1] + EDGE_NS)
+        known = (wanted >= stamps[0]) & (wanted <= stamps[-1])
         known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
         if known.any():
             # only the poses on both sides: a drive may have a million

@@ -131,8 +131,8 @@ class CloudBuilder:
         if base.pose_frame is None and base_T_sensor is not None:
             return _Place(base_T_sensor, None)
 
-        # before the poses have come so far, it is unknown whether the frame lies in a gap: the
-        # nearest pose serves at the end only
+        # before the poses have come so far, it is unknown whether the frame lies in a gap: they are
+        # continued at the end only
         is_known = is_end or self._poses.poses_have_passed(header.stamp_ns)
         pose = self._poses.track.at(header.stamp_ns) if is_known else None
         if pose is None:

@@ -146,7 +146,7 @@ def test_a_file_that_covers_part_of_the_log(tmp_path: Path) -> None:
     session = Session([FakeLog([STATIC, *sweeps(100)])], SessionOptions(poses=source))
     clouds = list(session.clouds())
     stamps = [c.header.stamp_ns - EPOCH for c in clouds]
-    # the nearest pose serves a tenth of a second
+    # poses are continued for a tenth of a second
     assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)
     after, before = sentences(lost(session.problems))
     assert after.startswith("/points: 58 of 100 frames are left out: their stamps")
@@ -255,7 +255,7 @@ def test_a_jump_ends_the_poses_and_is_named(engine: Any) -> None:
     session = Session([FakeLog([STATIC, *sweeps(20, many=60)])], SessionOptions(odometry="lidar"))
     clouds = list(session.clouds())
     assert len(engine.calls) == 7
-    assert len(clouds) == 7  # the nearest pose serves a tenth of a second
+    assert len(clouds) == 7  # the poses are continued for a tenth of a second
     assert any(
         "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in problem
         for problem in sentences(lost(session.problems))

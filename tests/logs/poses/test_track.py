@@ -47,9 +47,30 @@ def test_gap_and_outside_are_unknown() -> None:
     assert at(poses, 3.0) is None
     assert at(poses, -0.11) is None
     assert at(poses, 5.21) is None
-    before = at(poses, -0.09)
-    assert before is not None
-    assert before[0, 3] == 0.0
+
+
+@pytest.mark.parametrize("seconds", [-0.09, 1.06])
+def test_the_motion_goes_on_at_the_ends(seconds: float) -> None:
+    """A vehicle on a circle of 20 m, 2 m/s: a tenth of a second beyond its poses."""
+    circle = PoseTrack()
+    for k in range(11):
+        circle.append(EPOCH + k * S // 10, on_circle(0.1 * k))
+    pose = at(circle, seconds)
+    assert pose is not None
+    # between the poses its way is straight
+    np.testing.assert_allclose(pose, on_circle(seconds), atol=1e-3)
+
+
+def on_circle(seconds: float) -> Array:
+    angle = 0.1 * seconds
+    return yaw_transform(angle, (20.0 * np.sin(angle), 20.0 * (1.0 - np.cos(angle)), 0.0))
+
+
+def test_a_pose_alone_behind_a_gap_is_not_continued() -> None:
+    """Nothing tells how fast it moves there."""
+    pose = at(track(*np.arange(0, 1.01, 0.1), 5.0), 5.08)
+    assert pose is not None
+    assert pose[0, 3] == pytest.approx(10.0)
 
 
 def test_one_pose_serves_a_tenth_of_a_second() -> None:
@@ -144,24 +165,31 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         pose[:3, :3], pose[:3, 3] = rotation, position
         assert poses.append(stamp, pose)
     limit = poses.gap_limit_ns()
+
+    def between(t: int) -> Array | None:
+        """The pose at a stamp between the ends."""
+        k = max(int(np.searchsorted(stamps, t)), 1)
+        if not stamps[0] <= t <= stamps[-1]:
+            return None
+        if t not in stamps and stamps[k] - stamps[k - 1] > limit:
+            return None
+        w = (t - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
+        pose = np.eye(4)
+        pose[:3, :3] = Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix()
+        pose[:3, 3] = (1 - w) * positions[k - 1] + w * positions[k]
+        return pose
+
     for ms in wanted:
         t = ms * 1_000_000 + EPOCH
         found = poses.at(t)
         inside = int(np.clip(t, stamps[0], stamps[-1]))
-        k = max(int(np.searchsorted(stamps, inside)), 1)
-        is_exact = inside in stamps
-        is_known = abs(t - inside) <= 100_000_000 and (
-            is_exact or stamps[k] - stamps[k - 1] <= limit
-        )
-        assert (found is not None) == is_known
-        if found is not None:
-            w = (inside - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
-            np.testing.assert_allclose(
-                found[:3, 3], (1 - w) * positions[k - 1] + w * positions[k], atol=1e-9
-            )
-            np.testing.assert_allclose(
-                found[:3, :3], Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix(), atol=1e-7
-            )
+        expected = between(inside) if abs(t - inside) <= 100_000_000 else None
+        before = between(2 * inside - t)
+        if expected is not None and before is not None:
+            expected = expected @ np.linalg.inv(before) @ expected if t != inside else expected
+        assert (found is None) == (expected is None)
+        if found is not None and expected is not None:
+            np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
 def test_a_glitch_of_the_clock_is_taken_back() -> None:
