@@ -47,8 +47,8 @@ class LidarFrame:
 
     Rows with NaN, infinity or exactly zero are already gone. ``lost`` counts the points that were
     not finite although their cloud calls itself dense, ``without_return`` the ones that are gone
-    because they all have one range. ``origin`` (3,) is the sensor's centre in
-    its frame; None: the frame's own origin.
+    because they all have one range, ``unclaimed`` the ones that width and height leave out.
+    ``origin`` (3,) is the sensor's centre in its frame; None: the frame's own origin.
     """
 
     header: Header
@@ -60,6 +60,7 @@ class LidarFrame:
     remark: PointTimeRemark | None = None
     origin: F32 | None = None
     without_return: int = 0
+    unclaimed: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

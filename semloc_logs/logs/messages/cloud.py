@@ -128,6 +128,7 @@ def _sweep(header: Header, p: Points) -> LidarFrame:
         p.ring,
         remark=p.remark,
         without_return=p.without_return,
+        unclaimed=p.unclaimed,
     )
 
 

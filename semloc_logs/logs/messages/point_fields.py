@@ -38,7 +38,7 @@ class Points:
     """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
 
     ``not_finite`` counts the positions with NaN or infinity, ``without_return`` the ones at a range
-    that many share; ``remark`` is about the times.
+    that many share, ``unclaimed`` the ones beside width and height; ``remark`` is about the times.
     """
 
     points: F32
@@ -48,6 +48,7 @@ class Points:
     not_finite: int = 0
     remark: PointTimeRemark | None = None
     without_return: int = 0
+    unclaimed: int = 0
 
 
 # points at one range, all within so small a share of it, are rays without a return where they are
@@ -65,6 +66,9 @@ _NEAREST, _FARTHEST = 1e-7, 1e7
 _NONSENSE, _SENSE = 0.5, 0.95
 _LOOKED_AT = 1000  # points
 _FEWEST = 100  # points that show what their ranges have in common
+# bytes beside the rows hold points where their ranges differ by such factors from the cloud's usual
+# in the median, and so many times for nearly all of them
+_AS_FAR, _RANGES = 3.0, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +137,36 @@ def decode_points(
         not_finite=len(xyz) - finite,
         remark=remark,
         without_return=without_return,
+        unclaimed=_unclaimed(data, layout, rows, xyz if everything else xyz[valid]),
     )
+
+
+def _unclaimed(
+    data: bytes | memoryview, layout: Layout, rows: NDArray[np.void], points: F32
+) -> int:
+    """How many points lie in bytes that width and height leave out; 0 where these are padding.
+
+    ``points`` (n, 3) are the ones that they claim. Padding is zero, or not a number, or anything.
+    """
+    row, rest = divmod(rows.strides[0], layout.point_step)
+    count = len(data) // layout.point_step
+    if rest or count == layout.width * layout.height:  # no whole points behind a row, or none
+        return 0
+    places = np.arange(count)
+    is_claimed = (places // row < layout.height) & (places % row < layout.width)
+    others = np.frombuffer(data, rows.dtype, count)[~is_claimed]
+    if len(others) < _FEWEST or not len(points):
+        return 0
+    columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
+    some = slice(None, None, max(1, len(others) // _LOOKED_AT))
+    xyz = np.stack([others[columns[axis]][some].astype(np.float64) for axis in "xyz"], 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges = np.linalg.norm(xyz, axis=1)
+    own = points[:: max(1, len(points) // _LOOKED_AT)].astype(np.float64)
+    usual = float(np.median(np.linalg.norm(own, axis=1)))
+    is_point = (ranges > usual / _RANGES) & (ranges < usual * _RANGES)
+    middle = float(np.median(ranges[is_point])) if is_point.mean() > _SENSE else 0.0
+    return len(others) if usual / _AS_FAR < middle < usual * _AS_FAR else 0
 
 
 def _have_returned(xyz: F32, valid: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

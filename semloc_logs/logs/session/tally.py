@@ -92,6 +92,7 @@ class Tally:
         self._points: Counter[str] = Counter()
         self._lost_points: Counter[str] = Counter()
         self._without_return: Counter[str] = Counter()
+        self._unclaimed: Counter[str] = Counter()
         self._off_stamp_ns: dict[str, int] = {}
         self._span_ns: dict[str, int] = {}
         self._remarks: Counter[tuple[str, PointTimeRemark]] = Counter()
@@ -126,6 +127,7 @@ class Tally:
         self._points[topic] += frame.without_return
         self._lost_points[topic] += frame.lost
         self._without_return[topic] += frame.without_return
+        self._unclaimed[topic] += frame.unclaimed
         if frame.remark is not None:
             self._remarks[topic, frame.remark] += 1
         if frame.offset_ns is not None and len(frame.offset_ns):
@@ -163,6 +165,7 @@ class Tally:
             *self._lost_frames(track, base),
             *self._not_finite(),
             *self._not_returned(),
+            *self._not_claimed(),
             *self._unusual_times(),
         ]
 
@@ -202,6 +205,19 @@ class Tally:
                 lost=False,
             )
             for topic, count in sorted((+self._without_return).items())
+        ]
+
+    def _not_claimed(self) -> list[Problem]:
+        return [
+            Problem(
+                topic,
+                ProblemKind.FRAME,
+                f"{topic}: its clouds hold {count} points beside the {self._points[topic]} that "
+                f"their width and height claim, and these are left out: record clouds whose width, "
+                f"height and row_step fit their data.",
+                lost=True,
+            )
+            for topic, count in sorted((+self._unclaimed).items())
         ]
 
     def _unusual_times(self) -> list[Problem]:

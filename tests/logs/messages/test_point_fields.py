@@ -153,6 +153,36 @@ def test_rows_with_padding_and_points_that_are_none() -> None:
     assert len(decode_points(infinite, Layout(1, 1, 12, 12), XYZ, STAMP).points) == 0
 
 
+@pytest.mark.parametrize(
+    "layout",
+    [
+        Layout(200, 1, 12, 4800),  # half of the points in a row
+        Layout(20, 10, 12, 480),  # half of each row
+        Layout(40, 5, 12, 480),  # half of the rows
+    ],
+)
+@pytest.mark.parametrize(
+    ("behind", "unclaimed"),
+    [("points", 200), ("zeros", 0), ("nan", 0), ("anything", 0)],
+)
+def test_points_that_width_and_height_leave_out_are_counted(
+    layout: Layout, behind: str, unclaimed: int
+) -> None:
+    """400 points are there, 200 are claimed; other bytes in the place of these are padding."""
+    rng = np.random.default_rng(3)
+    xyz = rng.uniform(-20.0, 20.0, (400, 3)).astype("<f4")
+    place = np.arange(400)
+    row = 400 if layout.height == 1 else 40
+    is_behind = (place % row >= layout.width) | (place // row >= layout.height)
+    if behind == "anything":
+        xyz[is_behind] = np.frombuffer(rng.bytes(2400), "<f4").reshape(200, 3)
+    elif behind != "points":
+        xyz[is_behind] = np.nan if behind == "nan" else 0.0
+    p = decode_points(xyz.tobytes(), layout, XYZ, STAMP)
+    assert len(p.points) == 200
+    assert p.unclaimed == unclaimed
+
+
 def test_tags_of_a_livox() -> None:
     """Its drivers record them beside the line; a tag of another sensor means something else."""
     tag = Field("tag", 12, "u1")
