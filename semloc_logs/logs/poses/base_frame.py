@@ -12,6 +12,7 @@ import numpy as np
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, Header, PoseSample, TransformSample
+from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings, matrix
 from semloc_logs.logs.poses.pose_stream import FEWEST, PoseStream
 from semloc_logs.logs.poses.publishers import EdgePublishers
@@ -328,7 +329,35 @@ class BasePoses:
             )
             for parent, child in sorted(self._turned)
         ]
-        return [*turned, *self._stream.problems(), *self._publishers.problems(self._edge)]
+        return [
+            *turned,
+            *self._other_parents(),
+            *self._stream.problems(),
+            *self._publishers.problems(self._edge),
+        ]
+
+    def _other_parents(self) -> list[Problem]:
+        """Poses of TF end where their frame gets another parent, in which it is somewhere else."""
+        track = None if self._edge is None else self.tree.track(*self._edge)
+        if self._edge is None or track is None or track.end_ns is None:
+            return []
+        used, child = self._edge
+        last_ns = track.end_ns + track.gap_limit_ns()
+        others = [
+            parent
+            for parent, other_child, is_static in self.tree.edges
+            if other_child == child and parent != used and not is_static
+            if (self.tree.end_ns(parent, child) or 0) > last_ns
+        ]
+        if not others:
+            return []
+        names = " and ".join(f"'{parent}'" for parent in others)
+        text = (
+            f"TF gives '{child}' in '{used}' until {utc(track.end_ns)}, and afterwards in {names}:"
+            f" only its poses in '{used}' are used; cut the log there, or record one parent of"
+            f" '{child}'."
+        )
+        return [Problem("", ProblemKind.TRANSFORM, text, lost=True)]
 
     def _child_of(self, edge: Edge | None) -> str | None:
         """The frame that the poses of a TF edge, or without one of the fallback, belong to."""

@@ -183,6 +183,11 @@ class TransformTree:
         """The remembered history of a dynamic edge."""
         return self._moving.get((frame_name(parent), frame_name(child)))
 
+    def end_ns(self, parent: str, child: str) -> int | None:
+        """The newest stamp of a dynamic edge; None without any."""
+        track = self.track(parent, child)
+        return None if track is None else track.end_ns
+
     def pose_edge(self, frame: str) -> Edge | None:
         """The dynamic edge of a moving ``frame``: below ``odom`` if there is one, else the topmost.
 

@@ -39,7 +39,7 @@ from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.reading import reading_of
-from semloc_logs.logs.session.stamp_offsets import StampOffsets, lead, pose_topic
+from semloc_logs.logs.session.stamp_offsets import StampOffsets, lead, pose_topic, steady_shift
 from semloc_logs.logs.session.summary import conclude
 from semloc_logs.settings import Logs
 
@@ -158,6 +158,14 @@ class Session:
         """By how much (s) stamps of a topic are later than they can be; 0 where they are not."""
         poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
         return 0.0 if poses is None else lead(self.stamp_offsets, topic, poses)
+
+    def shift_of(self, topic: str) -> float:
+        """By how much (s) its stamps are earlier beside its recording than the ones of the poses.
+
+        0 where that is not steady.
+        """
+        poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
+        return 0.0 if poses is None else steady_shift(self.stamp_offsets, topic, poses)
 
     def off_stamp_of(self, topic: str) -> float:
         """From the header of sweeps to their nearest point (s), where most are far off; else 0."""

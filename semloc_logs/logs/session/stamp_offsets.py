@@ -315,6 +315,18 @@ def lead(offsets: StampOffsets, topic: str, poses: str) -> float:
     return later if later > _CLEARLY_LATER and own > _LATEST else 0.0
 
 
+def steady_shift(offsets: StampOffsets, topic: str, poses: str) -> float:
+    """By how much (s) stamps of a topic are earlier beside their recording than the poses' are.
+
+    0 where it differs from message to message, as where one of both is recorded when it can be.
+    """
+    if offsets.of(topic) is None or offsets.of(poses) is None:
+        return 0.0
+    relative = offsets.relative(topic, poses)
+    spread = float(np.quantile(relative, 0.9) - np.quantile(relative, 0.1))
+    return float(np.median(relative)) if spread < _NEARLY else 0.0
+
+
 def _stuck(topic: str, offset: StampOffset) -> Problem:
     text = (
         f"{topic}: {offset.stuck} of {offset.messages} header stamps hardly differ from the one of"

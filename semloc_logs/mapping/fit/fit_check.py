@@ -26,6 +26,7 @@ from semloc_logs.mapping.fit.findings import (
     StreamFit,
 )
 from semloc_logs.mapping.fit.keyframe_pairs import (
+    LEAST_SHARE,
     Clouds,
     Registered,
     Start,
@@ -83,8 +84,13 @@ MOST_OFF, MOST_TURNED = 2.5, 0.045
 UNEXPLAINED = 30.0  # times the noise of registration, of squared distances in the median
 LEAST_CONTRADICTIONS = 2  # one after the other
 
+# clouds usually have so many times the least share of points on planes of the ones beside them; so
+# many pairs in a row that have less are no single cloud that was damaged
+USUALLY_ALIKE, LEAST_STRANGERS = 5.0, 3
+
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
 NOTED, WRONG = 0.5, 1.0
+LATEST_POSES = 5.0  # s; ones that are computed slowly are recorded within two, most of them
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
@@ -118,6 +124,7 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         known = _stuck(session, topic) or _mounting_text(session, frames, voxel)
         if known:
             stream.findings = [Finding(Severity.WRONG, known)]
+        _add_far_clock(stream, session.shift_of(topic))
         _add_lead(stream, session.lead_of(topic), clouds)
         _add_off_stamp(stream, session.off_stamp_of(topic), clouds)
         if not stream.is_wrong:
@@ -150,6 +157,22 @@ def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
                     f" right one with --set logs.mountings.{child}=[x,y,z,qx,qy,qz,qw]"
                 )
     return ""
+
+
+def _add_far_clock(stream: StreamFit, shift: float) -> None:
+    """Stamps that are farther off beside their recording than the search for a clock reaches.
+
+    What the search found is something else then. No sensor is recorded so late, poses hardly are.
+    """
+    if -LATEST_POSES <= shift <= LONGEST_OFFSET:
+        return
+    side = "earlier" if shift > 0 else "later"
+    text = (
+        f"its stamps are {abs(shift):.2f} s {side} beside their recording than the ones of the"
+        " poses: the clock of one of both is another; give --set logs.time_offset."
+        f"{stream.topic}={shift:+.2f}, or --stamps log"
+    )
+    stream.findings = [Finding(Severity.WRONG, text)]
 
 
 def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
@@ -209,9 +232,46 @@ def check_stream(
         _contradictions(
             stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
         )
+        if not stream.findings:
+            _strangers(stream, clouds, numbers, given)
     elif not stream.findings:
         _unexplained(stream, given, poses_at, clouds)
     return stream
+
+
+def _strangers(
+    stream: StreamFit, clouds: Clouds, numbers: Sequence[tuple[int, int]], given: Registered
+) -> None:
+    """Names the time where clouds fit none beside them, from any start, although most others do."""
+    if float(np.median(given.share)) < USUALLY_ALIKE * LEAST_SHARE:
+        return
+    fitting = {(target, source) for target, source in given.numbers.tolist()}
+    lost = [pair for pair in numbers if pair not in fitting]
+    if not lost:
+        return
+    # of the pairs between the chosen ones, the ones beside these
+    everything = choose(clouds, len(clouds.rows))
+    place = {pair: number for number, pair in enumerate(everything)}
+    beside = {place[pair] + step for pair in lost for step in (-1, 1)}
+    untold = [everything[n] for n in sorted(beside) if 0 <= n < len(everything)]
+    untold = [pair for pair in untold if pair not in numbers]
+    found = registered(clouds, untold).numbers.tolist() if untold else []
+    lost += [pair for pair in untold if list(pair) not in found]
+    rows = np.array(sorted(place[pair] for pair in lost), np.int64)
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    rows = np.concatenate([run for run in runs if len(run) >= LEAST_STRANGERS] or [rows[:0]])
+    if not len(rows):
+        return
+    stamps_ns = clouds.stamps_ns()[np.array([everything[row] for row in rows])]
+    when = time_range(int(stamps_ns.min()), int(stamps_ns.max()))
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"{len(rows)} pairs of its clouds, one after the other, have no surfaces in common"
+            f" ({when}), which the others have: the sensor measured nothing but noise there, or was"
+            " covered; cut the log there",
+        )
+    )
 
 
 def _far_off(

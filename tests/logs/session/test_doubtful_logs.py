@@ -107,3 +107,43 @@ def test_points_that_are_not_in_metres_are_named_by_their_unit(
     assert len(named) == (scale > 1)
     assert bool(clouds) == (scale == 1.0)
     assert all(p.is_reported for p in named)
+
+
+@pytest.mark.parametrize("other", ["odom_2", "odom"])
+def test_a_frame_that_gets_another_parent_is_named(recorder: Recorder, other: str) -> None:
+    """From 1.5 s on, TF gives the vehicle in another frame, 10 m away."""
+    log = recorder()
+    for k in range(60):
+        stamp_ns = EPOCH + k * 50 * MS
+        is_moved = k >= 30 and other != "odom"
+        pose = yaw_transform(0.0, (0.1 * k + 10.0 * is_moved, 0.0, 0.0))
+        log.transform("odom" if k < 30 else other, "base_link", pose, stamp_ns, "/tf")
+        if k % 10 == 5:
+            log.cloud("/points", stamp_ns, "base_link", _sweep(seed=k))
+    session, clouds = _fused(log.write())
+    texts = [problem.text for problem in session.problems if "afterwards" in problem.text]
+    if other == "odom":
+        assert not texts
+        assert len(clouds) == 6
+        return
+    [text] = texts
+    assert text.startswith("TF gives 'base_link' in 'odom' until 2023-11-14T22:13:21.450Z")
+    assert "and afterwards in 'odom_2'" in text
+    assert len(clouds) == 3
+
+
+def test_stamps_farther_off_than_the_search_reaches_are_named_by_their_recording(
+    recorder: Recorder,
+) -> None:
+    """A steady drive hides the clock, which is 4 s behind."""
+    log = recorder()
+    for k in range(200):
+        stamp_ns = EPOCH + k * 50 * MS
+        log.pose(stamp_ns, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
+        if k % 10 == 5:
+            sweep = _sweep(seed=1)
+            sweep["x"] -= 0.1 * k
+            log.cloud("/points", stamp_ns - 4 * S, "base_link", sweep, late_ns=4 * S)
+    [finding] = _check(log.write()).streams[0].findings
+    assert finding.text.startswith("its stamps are 4.00 s earlier beside their recording")
+    assert "--set logs.time_offset./points=+4.00" in finding.text

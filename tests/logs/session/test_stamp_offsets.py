@@ -216,6 +216,23 @@ def test_stamps_later_than_their_recording_lead_by_what_a_clock_cannot(
     assert session.lead_of("/points") == pytest.approx(lead, abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("late", "shift"), [(lambda k: 4.0, 4.0), (lambda k: -4.0, -4.0), (lambda k: 0.1 * k, 0.0)]
+)
+def test_stamps_far_from_their_recording_are_of_another_clock_where_that_is_steady(
+    recorder: Recorder, late: Callable[[int], float], shift: float
+) -> None:
+    """Sweeps that a queue holds back are recorded later and later, by their own clock."""
+    log = recorder()
+    for k in range(60):
+        time_ns = EPOCH + k * 100 * MS
+        points = np.full(3, k, POINT)
+        log.cloud("/points", time_ns, "base_link", points, late_ns=round(late(k) * S))
+        log.pose(time_ns, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
+    session, _ = fused(log.write())
+    assert session.shift_of("/points") == pytest.approx(shift, abs=0.01)
+
+
 def test_zero_stamps_mean_log_times(recorder: Recorder) -> None:
     """Sweeps are recorded 0.1 s late: without stamps, that is their time."""
     path = drive(recorder, sweeps=None, poses=None)

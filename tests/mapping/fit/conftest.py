@@ -90,13 +90,15 @@ def drive(
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0),
     as_written: Callable[[F64], F64] = lambda poses: poses,
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    noisy: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Clouds, PoseTrack]:
     """Keyframes three times a second, and the poses twenty times a second, as they are written.
 
     The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
     (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
     A LIDAR sees all around, a camera ahead. ``signs``: an axis of the clouds may be mirrored.
-    ``origin``: where the sensor is in the base frame, as the log has it.
+    ``origin``: where the sensor is in the base frame, as the log has it. In the seconds ``noisy``
+    the points are anywhere.
     """
     world = street()
     rng = np.random.default_rng(5)
@@ -109,6 +111,8 @@ def drive(
     for time, pose in zip(taken, poses_of(taken), strict=True):
         points = apply(inverse(pose), world)
         points = points[np.linalg.norm(points, axis=1) < 18.0]
+        if noisy[0] <= time < noisy[1]:
+            points = rng.normal(0.0, 9.0, points.shape)
         if is_camera:
             points = seen_by_camera(points, rng)
         if is_fixed:

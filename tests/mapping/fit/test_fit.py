@@ -441,6 +441,14 @@ def test_odometry_that_slips_for_a_while_is_named_with_the_time(
     assert "(1970-01-01T00:00:09.500Z to 1970-01-01T00:00:12.833Z)" in text  # from 9 s to 12 s
 
 
+def test_clouds_of_noise_are_named_with_the_time_and_a_single_one_is_not(check: Check) -> None:
+    """Keyframes are a third of a second apart."""
+    text = _only(check(noisy=(6.0, 8.0)))
+    assert "pairs of its clouds, one after the other, have no surfaces in common" in text
+    assert "(1970-01-01T00:00:07.166Z to " in text
+    assert check(noisy=(6.0, 6.3)).findings == []
+
+
 def test_too_few_keyframes_tell_nothing(check: Check) -> None:
     fit = check(seconds=4.0)
     assert fit.findings == []
