@@ -89,6 +89,12 @@ class SessionMap:
         rotated = np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], view)
         return np.asarray(rotated + self.map_T_base[:, :3, 3])
 
+    def view_means(self) -> list[tuple[float, ...]]:
+        """As :attr:`views`, but in the base frame; empty where an earlier version lacks them."""
+        if "view_x" not in self.frames.column_names:
+            return []
+        return [tuple(view) for view in self._vectors("view").tolist()]
+
     def check_version(self) -> None:
         """Raises WorkspaceError when an earlier version fused the session."""
         if "view_x" not in self.frames.column_names:

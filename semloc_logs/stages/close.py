@@ -15,6 +15,7 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.same_recording import same_recordings
 from semloc_logs.closures.session_pairs import Pair, known_pairs
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
@@ -56,7 +57,10 @@ def close(
     searches = search.run(engine)
     is_new = decide_all(work, search.maps, settings, search.searched(), overwrite=overwrite)
     report = Report(closures=len(read_closures(work.closures)), amount=searches)
-    report.skipped += misfits_of(search.maps, settings).values()
+    misfits = misfits_of(search.maps, settings)
+    report.skipped += misfits.values()
+    fitting = {name: m for name, m in search.maps.items() if name not in misfits}
+    report.skipped += same_recordings(fitting)
     (report.done if is_new else report.kept).append("closures")
     return report
 

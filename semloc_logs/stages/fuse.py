@@ -102,6 +102,7 @@ def plan_fuse(
         present = {} if overwrite else _present(folder)
         reading = _as_read_before(present, settings)
         task = _task(session, folder, reading, others)
+        plan.report.skipped += _given_twice(task)
         if present.get("fingerprint") == task.fingerprint:
             plan.report.kept.append(session.name)
             plan.report.skipped += present["skipped"]
@@ -204,6 +205,18 @@ def _task(
     return FuseTask(
         logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings
     )
+
+
+def _given_twice(task: FuseTask) -> list[str]:
+    """A sentence for each part of a session that is the same as one before it."""
+    first: dict[str, Path] = {}
+    repeated = []
+    for log, content in zip(task.logs, task.made_from["content"], strict=True):
+        before = first.setdefault(content, log)
+        if before is not log:
+            what = "is given twice" if before == log else f"is the same as {before}"
+            repeated.append(f"Session {task.folder.name}: {log} {what}: give each part once.")
+    return repeated
 
 
 def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]) -> Mountings:

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -78,6 +79,27 @@ def test_session_json_is_read_once(
     done = was_done(fuse(settings=tools.coarse_settings(**changes)))
     assert done == bool(changes)
     assert [path.name for path in read] == ["session.json"]
+
+
+def test_a_part_that_is_given_twice_is_named(
+    drives: dict[str, Any], tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    [monday] = tools.inputs(drives, "monday")
+    log = monday.logs[0]
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(log, copy)
+    twice = replace(monday, logs=(log, copy, log))
+    plan = fuse_stage.plan_fuse([twice], Workspace(tmp_path / "w"), tools.coarse_settings())
+    assert plan.report.skipped == [
+        f"Session monday: {copy} is the same as {log}: give each part once.",
+        f"Session monday: {log} is given twice: give each part once.",
+    ]
+    assert (
+        fuse_stage.plan_fuse(
+            [monday], Workspace(tmp_path / "w"), tools.coarse_settings()
+        ).report.skipped
+        == []
+    )
 
 
 @pytest.mark.parametrize("damaged", ["", '{"name": "mon', "[]", "{}"])

@@ -1,0 +1,52 @@
+"""Sessions of one recording are known by their measurements."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from semloc_logs.closures.same_recording import same_recordings
+
+S = 1_000_000_000
+
+
+def session(first: int, last: int, seed: int = 0) -> Any:
+    """Keyframes each second; what is seen at a time follows from ``seed``."""
+    means = np.random.default_rng(seed).normal(size=(100, 3))[first:last]
+    stamps_ns = np.arange(first, last) * S
+    return cast(
+        Any,
+        SimpleNamespace(
+            stamps_ns=stamps_ns, view_means=lambda: [tuple(mean) for mean in means.tolist()]
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "count"),
+    [
+        (session(0, 20), session(0, 20), 20),  # one log under two names
+        (session(0, 20), session(15, 40), 5),  # a part that both have
+        (session(0, 1), session(0, 1), 1),  # single sweeps
+        (session(0, 20), session(18, 40), 0),  # two keyframes of many
+        (session(0, 20), session(0, 20, seed=1), 0),  # simulated time starts at 0 in both
+        (session(0, 20), session(20, 40), 0),
+    ],
+)
+def test_sessions_of_one_recording_are_named(a: Any, b: Any, count: int) -> None:
+    sentences = same_recordings({"b": b, "a": a, "other": session(60, 80)})
+    if not count:
+        assert sentences == []
+        return
+    [sentence] = sentences
+    assert sentence.startswith(
+        f"Sessions a and b are of one recording: {count} of their keyframes are the same"
+    )
+
+
+def test_sessions_of_earlier_versions_are_not_compared() -> None:
+    old = SimpleNamespace(stamps_ns=np.arange(20) * S, view_means=list)
+    assert same_recordings({"a": cast(Any, old), "b": cast(Any, old)}) == []
