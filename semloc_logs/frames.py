@@ -38,6 +38,7 @@ class PointTimeRemark(Enum):
 
     OTHER_CLOCK = "other clock"  # the first point is taken to be measured at the header's time
     UNUSABLE = "unusable"  # no unit and origin makes them times within a sweep
+    OTHER_UNIT = "other unit"  # as they are defined, points would be measured too fast
     OFF_STAMP = "off stamp"  # they are used, but none of them is near to the header's time
 
 

@@ -212,10 +212,12 @@ def _given_twice(task: FuseTask) -> list[str]:
     first: dict[str, Path] = {}
     repeated = []
     for log, content in zip(task.logs, task.made_from["content"], strict=True):
-        before = first.setdefault(content, log)
-        if before is not log:
+        if content in first:
+            before = first[content]
             what = "is given twice" if before == log else f"is the same as {before}"
             repeated.append(f"Session {task.folder.name}: {log} {what}: give each part once.")
+        else:
+            first[content] = log
     return repeated
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import F64, Frame, Header, LidarFrame
+from semloc_logs.frames import F64, Frame, Header, LidarFrame, PointTimeRemark
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages import livox
 from semloc_logs.logs.messages.definitions import UndecodableError, binary
@@ -23,7 +23,7 @@ from semloc_logs.logs.messages.headers import (
     vector,
 )
 from semloc_logs.logs.messages.point_fields import Field, Layout, Points, decode_points, is_noise
-from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS, sweep_unit
 from semloc_logs.numerics import transforms
 
 # sensor_msgs/PointField
@@ -86,6 +86,8 @@ def _cloud_pose(pose: Any) -> F64:
 def _livox(m: Any, message: Message) -> Iterator[Frame]:
     header = header_at(check_time(m.sec * 1_000_000_000 + m.nanosec), m.frame_id, message)
     offset = m.points["offset_time"].astype(np.int64)
+    unit = sweep_unit(offset)
+    offset *= unit
     # the base of the times is the stamp unless the sensor has a clock of its own
     start = m.timebase_ns - header.stamp_ns
     if abs(start) < LONGEST_SWEEP_NS:
@@ -101,6 +103,7 @@ def _livox(m: Any, message: Message) -> Iterator[Frame]:
         offset[kept],
         m.points["line"][kept].astype(np.uint16),
         int((~finite).sum()),
+        remark=None if unit == 1 else PointTimeRemark.OTHER_UNIT,
     )
 
 

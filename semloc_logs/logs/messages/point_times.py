@@ -26,6 +26,7 @@ _ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
 _OFF_STAMP_NS = 100_000_000  # from the header to the nearest point: publishing takes less
 _FEWEST = 100  # points of a sweep whose order can be judged
+_MOST_PER_SECOND = 1e7  # points; the fastest LIDARs measure a few millions
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
 
@@ -96,6 +97,20 @@ def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
         if time.dtype.kind in "iu"
         else (1_000_000_000, 1_000_000, 1_000, 1)
     )
+
+
+def sweep_unit(time: NDArray[np.int64]) -> int:
+    """Nanoseconds of the unit of times (n,) that are defined to be nanoseconds; mostly 1.
+
+    Some writers fill in microseconds or milliseconds: then no sensor would be so fast.
+    """
+    if len(time) < _FEWEST:
+        return 1
+    span = int(time.max()) - int(time.min())
+    if not span or len(time) <= span * 1e-9 * _MOST_PER_SECOND:
+        return 1
+    units = (1_000, 1_000_000)
+    return next((u for u in units if _LEAST_SPAN_NS <= span * u < LONGEST_SWEEP_NS // 2), 1)
 
 
 def _to_ns(value: float, unit: int) -> int:

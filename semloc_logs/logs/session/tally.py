@@ -21,6 +21,10 @@ _REMARKS = {
         "sweeps are used as measured, with the motion of the vehicle in them: their point times "
         "are not times within a sweep"
     ),
+    PointTimeRemark.OTHER_UNIT: (
+        "sweeps have point times in microseconds or milliseconds, it seems: in nanoseconds, as "
+        "their message defines them, more points would be measured than any sensor can"
+    ),
     PointTimeRemark.OFF_STAMP: (
         "sweeps have points that were all measured {gap:.2f} s or more before or after the time of "
         "their header: the times of the points are used, but one of both is wrong"
