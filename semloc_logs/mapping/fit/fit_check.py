@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.logs.poses.plausibility import implausible
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.fit.fault_texts import fault_text
 from semloc_logs.mapping.fit.findings import (
@@ -25,6 +26,7 @@ from semloc_logs.mapping.fit.findings import (
     Severity,
     StreamFit,
 )
+from semloc_logs.mapping.fit.interpolation import interpolation_errors
 from semloc_logs.mapping.fit.keyframe_pairs import (
     LEAST_SHARE,
     Clouds,
@@ -91,6 +93,7 @@ USUALLY_ALIKE, LEAST_STRANGERS = 5.0, 3
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
 NOTED, WRONG = 0.5, 1.0
 LATEST_POSES = 5.0  # s; ones that are computed slowly are recorded within two, most of them
+OFTEN = 0.9  # of the keyframes have a smaller error
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
@@ -124,6 +127,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         known = _stuck(session, topic) or _mounting_text(session, frames, voxel)
         if known:
             stream.findings = [Finding(Severity.WRONG, known)]
+        if not session.are_poses_fixes:
+            _add_coarse(stream, track, clouds)
         _add_far_clock(stream, session.shift_of(topic))
         _add_lead(stream, session.lead_of(topic), clouds)
         _add_off_stamp(stream, session.off_stamp_of(topic), clouds)
@@ -157,6 +162,21 @@ def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
                     f" right one with --set logs.mountings.{child}=[x,y,z,qx,qy,qz,qw]"
                 )
     return ""
+
+
+def _add_coarse(stream: StreamFit, track: PoseTrack, clouds: Clouds) -> None:
+    """Poses that are too far apart: what is wrong between them looks like a clock."""
+    meters, radians = interpolation_errors(track, clouds.stamps_ns())
+    effects = meters / clouds.voxel + radians * NEAR_VOXELS
+    if not len(effects) or float(np.quantile(effects, OFTEN)) < WRONG:
+        return
+    apart = float(np.median(np.diff(track.stamps_ns))) * 1e-9
+    text = (
+        f"the poses are {apart:.1f} s apart, too far for this drive: between them they are off by"
+        f" up to {meters.max():.1f} m and {np.degrees(radians.max()):.0f} degrees; record poses"
+        " more often, or use --odometry lidar"
+    )
+    stream.findings = [Finding(Severity.WRONG, text)]
 
 
 def _add_far_clock(stream: StreamFit, shift: float) -> None:

@@ -21,7 +21,6 @@ from semloc_logs.errors import RoleError
 from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.messages.point_times import sweep_unit
 from semloc_logs.logs.problems import Problems, lost, sentences
 from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import find_roles, guess_roles

@@ -147,3 +147,21 @@ def test_stamps_farther_off_than_the_search_reaches_are_named_by_their_recording
     [finding] = _check(log.write()).streams[0].findings
     assert finding.text.startswith("its stamps are 4.00 s earlier beside their recording")
     assert "--set logs.time_offset./points=+4.00" in finding.text
+
+
+@pytest.mark.parametrize(("period", "is_named"), [(20, True), (4, False)])
+def test_poses_too_far_apart_for_the_turns_are_named(
+    recorder: Recorder, period: int, is_named: bool
+) -> None:
+    """5 m/s on a circle of 10 m, poses 1 or 0.2 s apart: halfway 0.31 or 0.01 m off."""
+    log = recorder()
+    for k in range(400):
+        angle = 0.025 * k
+        place = (10.0 * np.sin(angle), 10.0 * (1.0 - np.cos(angle)), 0.0)
+        if k % period == 0:
+            log.pose(EPOCH + k * 50 * MS, yaw_transform(angle, place))
+        if k % period == period // 2:
+            log.cloud("/points", EPOCH + k * 50 * MS, "base_link", _sweep(seed=k))
+    texts = [finding.text for finding in _check(log.write()).streams[0].findings]
+    apart = "the poses are 1.0 s apart, too far for this drive: between them they are off by up to"
+    assert any(apart + " 0.3 m and 0 degrees" in text for text in texts) is is_named
