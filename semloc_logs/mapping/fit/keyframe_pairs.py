@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ LOOKED_AT = 5  # keyframes that show the field of view
 ONE_SIDE = 0.6
 LEAST_RMS = 0.02  # voxels; distances to planes are not smaller
 UNTOLD = 1e-4  # information along a direction that no plane fixes (1/m^2): 100 m, or any angle
+KEPT = 128  # keyframes whose planes stay in memory, half a megabyte each at most
 LEAST_SHARE = 0.02  # of the points on planes, for a registration
 THERE_AND_BACK = 12  # pairs that show the noise of registration
 CORRELATED = 12.0  # points of one surface share their error: as many count as one
@@ -75,8 +76,22 @@ class Clouds:
         """Points (n, 3) of a keyframe in the base frame."""
         return self.collected.load(int(self.rows[number]))[0].astype(float)
 
-    def some_points(self, number: int) -> F64:
-        """As :meth:`points`, thinned to what a registration moves."""
+    @cached_property
+    def some_points(self) -> Callable[[int], F64]:
+        """As :meth:`points`, thinned to what a registration moves; the last ones are kept."""
+        return lru_cache(maxsize=KEPT)(self._thinned)
+
+    @cached_property
+    def planes(self) -> Callable[[int], tuple[PlaneCells, PlaneCells]]:
+        """The planes of a keyframe, in coarse and in fine cells; the last ones are kept."""
+        return lru_cache(maxsize=KEPT)(self._planes)
+
+    def _planes(self, number: int) -> tuple[PlaneCells, PlaneCells]:
+        points = self.points(number)
+        coarse = PlaneCells.of(points, COARSE * self.voxel)
+        return coarse, PlaneCells.of(points, FINE * self.voxel)
+
+    def _thinned(self, number: int) -> F64:
         points = self.collected.load(int(self.rows[number]))[0]
         points = points[thin(points, self.voxel)]
         return points[:: max(1, len(points) // MOST_POINTS)].astype(float)
@@ -166,20 +181,15 @@ class Registered:
 
 
 class Registrar:
-    """Registers pairs of one stream; the last target and the last source are kept."""
+    """Registers pairs of one stream."""
 
     def __init__(self, clouds: Clouds) -> None:
         self._clouds = clouds
-        self._target = -1
-        self._coarse: PlaneCells | None = None
-        self._fine: PlaneCells | None = None
-        self._source = -1
-        self._points = np.zeros((0, 3))
 
     def fit(self, target: int, source: int, starts: list[F64]) -> Fit:
         """The best fit of the source from ``starts`` (4, 4); an earlier one where equal."""
-        coarse, fine = self._planes(target)
-        points = self._some_points(source)
+        coarse, fine = self._clouds.planes(target)
+        points = self._clouds.some_points(source)
         best: Fit | None = None
         for start in starts:
             moved = register(fine, points, register(coarse, points, start).target_T_source)
@@ -190,29 +200,15 @@ class Registrar:
 
     def shares(self, target: int, source: int, poses: Sequence[F64]) -> F64:
         """The share of the source's points that lies on planes at each of ``poses`` (4, 4)."""
-        planes = self._planes(target)[1]
-        points = self._some_points(source)
+        planes = self._clouds.planes(target)[1]
+        points = self._clouds.some_points(source)
         return np.array([share_at(planes, points, pose) for pose in poses])
 
     def shares_along(self, target: int, source: int, poses: Sequence[F64], direction: F64) -> F64:
         """As :meth:`shares`, of what shows a motion along a unit ``direction`` (3,)."""
-        planes = self._planes(target)[1]
-        points = self._some_points(source)
+        planes = self._clouds.planes(target)[1]
+        points = self._clouds.some_points(source)
         return np.array([share_along(planes, points, pose, direction) for pose in poses])
-
-    def _some_points(self, source: int) -> F64:
-        if self._source != source:
-            self._source = source
-            self._points = self._clouds.some_points(source)
-        return self._points
-
-    def _planes(self, target: int) -> tuple[PlaneCells, PlaneCells]:
-        if self._coarse is None or self._fine is None or self._target != target:
-            points = self._clouds.points(target)
-            self._target = target
-            self._coarse = PlaneCells.of(points, COARSE * self._clouds.voxel)
-            self._fine = PlaneCells.of(points, FINE * self._clouds.voxel)
-        return self._coarse, self._fine
 
 
 def covariance_of(fit: Fit, voxel: float) -> F64:

@@ -113,6 +113,7 @@ def _key(x: float, y: float, z: float, size: float) -> int:
 def _planes(points: F64, size: float) -> tuple[I64, I64, F64, F64]:
     table = empty_table(len(points))
     rows = np.full(len(table), -1, np.int64)
+    keys = np.empty(len(points), np.int64)
     moments = np.zeros((len(points), MOMENTS))
     corner = np.zeros((len(points), 3))
     count = 0
@@ -123,6 +124,7 @@ def _planes(points: F64, size: float) -> tuple[I64, I64, F64, F64]:
         if table[place] == EMPTY:
             table[place] = key
             rows[place] = count
+            keys[count] = key
             corner[count, 0] = np.floor(x / size) * size
             corner[count, 1] = np.floor(y / size) * size
             corner[count, 2] = np.floor(z / size) * size
@@ -131,9 +133,9 @@ def _planes(points: F64, size: float) -> tuple[I64, I64, F64, F64]:
         # about the corner of the cell: sums of squares lose digits with the distance
         add_point(moments[row], x - corner[row, 0], y - corner[row, 1], z - corner[row, 2], 1.0)
 
+    planes = 0
     means = np.zeros((count, 3))
     normals = np.zeros((count, 3))
-    is_plane = np.zeros(count, np.bool_)
     mean = np.zeros(3)
     a = np.zeros((3, 3))
     values = np.zeros(3)
@@ -148,14 +150,20 @@ def _planes(points: F64, size: float) -> tuple[I64, I64, F64, F64]:
         length = np.sqrt(max(values[2], 0.0))
         if thickness > THIN * width or width < WIDE * length or length == 0.0:
             continue
-        is_plane[row] = True
+        keys[planes] = keys[row]
         for k in range(3):
-            means[row, k] = mean[k] + corner[row, k]
-            normals[row, k] = vectors[k, 0]
-    for place in range(len(rows)):
-        if rows[place] >= 0 and not is_plane[rows[place]]:
-            rows[place] = -1
-    return table, rows, means, normals
+            means[planes, k] = mean[k] + corner[row, k]
+            normals[planes, k] = vectors[k, 0]
+        planes += 1
+
+    # a table of the planes alone is small enough for the caches: it is looked up many times
+    table = empty_table(planes)
+    rows = np.full(len(table), -1, np.int64)
+    for row in range(planes):
+        place = place_of(table, keys[row])
+        table[place] = keys[row]
+        rows[place] = row
+    return table, rows, means[:planes].copy(), normals[:planes].copy()
 
 
 @njit(cache=True, nogil=True)
