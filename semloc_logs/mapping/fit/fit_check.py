@@ -87,7 +87,7 @@ UNEXPLAINED = 30.0  # times the noise of registration, of squared distances in t
 LEAST_CONTRADICTIONS = 2  # one after the other
 
 # clouds usually have so many times the least share of points on planes of the ones beside them; so
-# many pairs in a row that have less are no single cloud that was damaged
+# many pairs in a row that have less are more than one damaged cloud
 USUALLY_ALIKE, LEAST_STRANGERS = 5.0, 3
 
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
@@ -165,7 +165,7 @@ def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
 
 
 def _add_coarse(stream: StreamFit, track: PoseTrack, clouds: Clouds) -> None:
-    """Poses that are too far apart: what is wrong between them looks like a clock."""
+    """Poses that are too far apart: errors between them look like a clock."""
     meters, radians = interpolation_errors(track, clouds.stamps_ns())
     effects = meters / clouds.voxel + radians * NEAR_VOXELS
     if not len(effects) or float(np.quantile(effects, OFTEN)) < WRONG:
