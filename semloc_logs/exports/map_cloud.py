@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.exports.point_formats import point_colours
-from semloc_logs.logs.annotation.channels import Cloud
+from semloc_logs.logs.annotation.scene import Cloud
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 

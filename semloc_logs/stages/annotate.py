@@ -24,13 +24,8 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
-from semloc_logs.logs.annotation.channels import (
-    COMMON_FRAME,
-    Drive,
-    Scene,
-    StampedPose,
-    Transform,
-)
+from semloc_logs.logs.annotation.channels import COMMON_FRAME
+from semloc_logs.logs.annotation.scene import Drive, Scene, StampedPose, Transform
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, transform

@@ -10,7 +10,8 @@ import pytest
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports import Selection, export
 from semloc_logs.logs.annotation.annotate import encoder_for
-from semloc_logs.logs.annotation.channels import Cloud, Encoding, LogFacts
+from semloc_logs.logs.annotation.channels import Encoding, LogFacts
+from semloc_logs.logs.annotation.scene import Cloud
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table

@@ -15,21 +15,17 @@ from typing import BinaryIO
 from semloc_logs import __version__
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import (
-    NO_SCENE,
     QOS_KEY,
-    ClosureRecord,
     Encoder,
     Encoding,
-    LogContext,
     LogFacts,
     NewChannel,
     NewMessage,
-    Scene,
     channel_metadata,
-    encode,
     is_old_marker,
-    run_id,
 )
+from semloc_logs.logs.annotation.closure_messages import LogContext, encode, run_id
+from semloc_logs.logs.annotation.closure_record import ClosureRecord
 from semloc_logs.logs.annotation.mcap_append import (
     METADATA_PREFIX,
     AppendPlan,
@@ -48,6 +44,7 @@ from semloc_logs.logs.annotation.rosbag_copy import (
     write_bag,
     write_copy,
 )
+from semloc_logs.logs.annotation.scene import NO_SCENE, Scene
 from semloc_logs.logs.annotation.tail_swap import (
     SIDE_SUFFIX,
     copy_start,

@@ -16,24 +16,17 @@ from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from semloc_logs.logs.annotation.channels import (
-    F64,
-    ClosureRecord,
-    Cloud,
-    Colour,
-    Kind,
-    Mark,
-    NewChannel,
-    Overview,
-    StampedPose,
-    Transform,
-)
+from semloc_logs.logs.annotation.channels import Kind, NewChannel
+from semloc_logs.logs.annotation.closure_record import ClosureRecord
+from semloc_logs.logs.annotation.markers import Marker, MarkerGroup, Shape
+from semloc_logs.logs.annotation.scene import F64, Cloud, Colour, StampedPose, Transform
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
@@ -109,66 +102,16 @@ class FoxgloveEncoder:
             message.fields.add(name=name, offset=offset, type=element)
         return self._bytes(message)
 
-    def mark(self, mark: Mark) -> bytes:
+    def markers(self, groups: Sequence[MarkerGroup]) -> bytes:
         update = SceneUpdate()
-        entity = update.entities.add(
-            timestamp=_time(mark.stamp_ns), frame_id=mark.frame_id, id=f"semloc/{mark.key}"
-        )
-        entity.lifetime.SetInParent()  # zero: stays
-        entity.frame_locked = True
-        color = _color(mark.color)
-        sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
-        _set_pose(sphere.pose, mark.position)
-        text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
-        _set_pose(text.pose, mark.text_position())
-        if mark.other is not None:
-            line = entity.lines.add(
-                type=LinePrimitive.LINE_LIST,
-                thickness=mark.size / 5,
-                points=_points([mark.position, mark.other]),
-                color=color,
-            )
-            _set_pose(line.pose, np.zeros(3))
-        return self._bytes(update)
-
-    def overview(self, overview: Overview) -> bytes:
-        update = SceneUpdate()
-        time = _time(overview.stamp_ns)
-        thickness = overview.size / 5
-        for drive in overview.drives:
+        for group in groups:
             entity = update.entities.add(
-                timestamp=time, frame_id=drive.frame_id, id=f"semloc/drives/{drive.session}"
+                timestamp=_time(group.stamp_ns), frame_id=group.frame_id, id=group.name
             )
-            color = _color(drive.color)
-            line = entity.lines.add(
-                type=LinePrimitive.LINE_STRIP,
-                thickness=thickness,
-                points=_points(drive.positions),
-                color=color,
-            )
-            _set_pose(line.pose, np.zeros(3))
-            size = 2 * overview.size
-            text = entity.texts.add(billboard=True, font_size=size, color=color, text=drive.session)
-            _set_pose(text.pose, drive.name_position(size))
-        entity = update.entities.add(
-            timestamp=time, frame_id=overview.frame_id, id="semloc/closures"
-        )
-        for mark in overview.marks:
-            color = _color(mark.color)
-            sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
-            _set_pose(sphere.pose, mark.position)
-        lines = overview.lines()
-        if lines:
-            line = entity.lines.add(
-                type=LinePrimitive.LINE_LIST,
-                thickness=thickness,
-                points=_points([end for end, _ in lines]),
-                colors=[_color(color) for _, color in lines],
-            )
-            _set_pose(line.pose, np.zeros(3))
-        for entity in update.entities:
             entity.lifetime.SetInParent()  # zero: stays
             entity.frame_locked = True
+            for marker in group.markers:
+                _add_marker(entity, marker)
         return self._bytes(update)
 
     def transforms(self, transforms: Sequence[Transform]) -> bytes:
@@ -188,6 +131,29 @@ class FoxgloveEncoder:
         if self.encoding == "protobuf":
             return bytes(message.SerializeToString(deterministic=True))
         return json.dumps(_json_value(message), allow_nan=False).encode()
+
+
+def _add_marker(entity: SceneEntity, marker: Marker) -> None:
+    colors = [_color(color) for color in marker.colors or (marker.color,)]
+    if marker.shape in (Shape.SPHERE, Shape.SPHERES):
+        for position, color in zip(marker.points, colors, strict=True):
+            sphere = entity.spheres.add(size=dict.fromkeys("xyz", marker.size), color=color)
+            _set_pose(sphere.pose, position)
+    elif marker.shape is Shape.TEXT:
+        text = entity.texts.add(
+            billboard=True, font_size=marker.size, color=colors[0], text=marker.text
+        )
+        _set_pose(text.pose, marker.points[0])
+    else:
+        is_strip = marker.shape is Shape.LINE_STRIP
+        line = entity.lines.add(
+            type=LinePrimitive.LINE_STRIP if is_strip else LinePrimitive.LINE_LIST,
+            thickness=marker.size,
+            points=_points(marker.points),
+            color=None if marker.colors else colors[0],
+            colors=colors if marker.colors else (),
+        )
+        _set_pose(line.pose, np.zeros(3))
 
 
 def _class_of(kind: Kind) -> Any:

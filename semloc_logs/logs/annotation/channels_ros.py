@@ -10,18 +10,10 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.logs.annotation.channels import (
-    F64,
-    ClosureRecord,
-    Cloud,
-    Colour,
-    Kind,
-    Mark,
-    NewChannel,
-    Overview,
-    StampedPose,
-    Transform,
-)
+from semloc_logs.logs.annotation.channels import Kind, NewChannel
+from semloc_logs.logs.annotation.closure_record import ClosureRecord
+from semloc_logs.logs.annotation.markers import Marker, MarkerGroup, Shape
+from semloc_logs.logs.annotation.scene import F64, Cloud, Colour, StampedPose, Transform
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
@@ -39,7 +31,13 @@ NAMES = {
 }
 _UINT8, _FLOAT32 = 2, 7  # values of sensor_msgs/PointField.datatype
 # values of visualization_msgs/Marker.type, equal in ROS 1 and 2
-_SPHERE, _LINE_STRIP, _LINE_LIST, _SPHERE_LIST, _TEXT = (2, 4, 5, 7, 9)
+_SHAPES = {
+    Shape.SPHERE: 2,
+    Shape.LINE_STRIP: 4,
+    Shape.LINE_LIST: 5,
+    Shape.SPHERES: 7,
+    Shape.TEXT: 9,
+}
 
 
 class RosEncoder:
@@ -92,88 +90,12 @@ class RosEncoder:
         )
         return self._bytes(message)
 
-    def mark(self, mark: Mark) -> bytes:
-        shared = {
-            "header": self._header(mark.stamp_ns, mark.frame_id),
-            "id": mark.key,
-            "color": self._color(mark.color),
-            "frame_locked": True,
-        }
+    def markers(self, groups: Sequence[MarkerGroup]) -> bytes:
         markers = [
-            self._marker(
-                _SPHERE,
-                "semloc/places",
-                (mark.size,) * 3,
-                pose=self._place(mark.position),
-                **shared,
-            )
+            self._marker(marker, group, self._header(group.stamp_ns, group.frame_id))
+            for group in groups
+            for marker in group.markers
         ]
-        if mark.other is not None:
-            ends = [self._point(mark.position), self._point(mark.other)]
-            width = mark.size / 5
-            markers.append(
-                self._marker(
-                    _LINE_LIST, "semloc/closures", (width, 0.0, 0.0), points=ends, **shared
-                )
-            )
-        markers.append(
-            self._marker(
-                _TEXT,
-                "semloc/names",
-                (0.0, 0.0, mark.size),
-                pose=self._place(mark.text_position()),
-                text=mark.text,
-                **shared,
-            )
-        )
-        return self._bytes(self._new(MARKERS, markers=markers))
-
-    def overview(self, overview: Overview) -> bytes:
-        width = overview.size / 5
-        markers = []
-        for key, drive in enumerate(overview.drives):
-            shared = {
-                "header": self._header(overview.stamp_ns, drive.frame_id),
-                "id": key,
-                "color": self._color(drive.color),
-                "frame_locked": True,
-            }
-            points = [self._point(position) for position in drive.positions]
-            markers.append(
-                self._marker(
-                    _LINE_STRIP, "semloc/drives", (width, 0.0, 0.0), points=points, **shared
-                )
-            )
-            size = 2 * overview.size
-            markers.append(
-                self._marker(
-                    _TEXT,
-                    "semloc/sessions",
-                    (0.0, 0.0, size),
-                    pose=self._place(drive.name_position(size)),
-                    text=drive.session,
-                    **shared,
-                )
-            )
-        places = [(mark.position, mark.color) for mark in overview.marks]
-        lists = (
-            (_SPHERE_LIST, "semloc/places", (overview.size,) * 3, places),
-            (_LINE_LIST, "semloc/closures", (width, 0.0, 0.0), overview.lines()),
-        )
-        for kind, ns, scale, coloured in lists:
-            if coloured:
-                markers.append(
-                    self._marker(
-                        kind,
-                        ns,
-                        scale,
-                        header=self._header(overview.stamp_ns, overview.frame_id),
-                        color=self._color((1.0, 1.0, 1.0, 1.0)),
-                        points=[self._point(position) for position, _ in coloured],
-                        colors=[self._color(color) for _, color in coloured],
-                        frame_locked=True,
-                    )
-                )
         return self._bytes(self._new(MARKERS, markers=markers))
 
     def transforms(self, transforms: Sequence[Transform]) -> bytes:
@@ -196,14 +118,29 @@ class RosEncoder:
             ),
         )
 
-    def _marker(self, kind: int, ns: str, scale: tuple[float, ...], **more: Any) -> Any:
-        given = {
-            "ns": ns,
-            "type": kind,
-            "pose": self._place(np.zeros(3)),
-            "scale": self._new("geometry_msgs/msg/Vector3", x=scale[0], y=scale[1], z=scale[2]),
+    def _marker(self, marker: Marker, group: MarkerGroup, header: Any) -> Any:
+        one_place = marker.shape in (Shape.SPHERE, Shape.TEXT)
+        points = [] if one_place else [self._point(position) for position in marker.points]
+        across = marker.size if marker.shape in (Shape.SPHERE, Shape.SPHERES) else 0.0
+        scale = {
+            "x": 0.0 if marker.shape is Shape.TEXT else marker.size,
+            "y": across,
+            "z": marker.size if marker.shape is Shape.TEXT else across,
         }
-        return self._new("visualization_msgs/msg/Marker", **(given | more))
+        return self._new(
+            "visualization_msgs/msg/Marker",
+            header=header,
+            ns=marker.kind,
+            id=group.number,
+            type=_SHAPES[marker.shape],
+            pose=self._place(marker.points[0] if one_place else np.zeros(3)),
+            scale=self._new("geometry_msgs/msg/Vector3", **scale),
+            color=self._color(marker.color),
+            frame_locked=True,
+            points=points,
+            colors=[self._color(color) for color in marker.colors],
+            text=marker.text,
+        )
 
     def _color(self, color: Colour) -> Any:
         return self._new("std_msgs/msg/ColorRGBA", **dict(zip("rgba", color, strict=True)))

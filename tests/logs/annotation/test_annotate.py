@@ -31,7 +31,7 @@ from semloc_logs.logs.annotation.annotate import (
     content_fingerprint,
     recover,
 )
-from semloc_logs.logs.annotation.channels import Cloud, Scene
+from semloc_logs.logs.annotation.scene import Cloud, Scene
 
 TEXT = "std_msgs/msg/String"
 

@@ -19,26 +19,19 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from semloc_logs.errors import ContractError
 from semloc_logs.logs.annotation.annotate import encoder_for
 from semloc_logs.logs.annotation.channels import (
-    COLUMNS,
-    NO_SCENE,
     TOPICS,
-    ClosureRecord,
-    Cloud,
-    Drive,
     Encoding,
-    LogContext,
     LogFacts,
     NewChannel,
     NewMessage,
-    Scene,
-    StampedPose,
     channel_metadata,
-    encode,
     latched,
-    run_id,
     topics_of_targets,
 )
 from semloc_logs.logs.annotation.channels_foxglove import loop_closure_class
+from semloc_logs.logs.annotation.closure_messages import LogContext, encode, run_id
+from semloc_logs.logs.annotation.closure_record import COLUMNS, ClosureRecord
+from semloc_logs.logs.annotation.scene import NO_SCENE, Cloud, Drive, Scene, StampedPose
 from semloc_logs.numerics.transforms import transform, yaw_transform
 from semloc_logs.schemas import read_text
 
