@@ -33,6 +33,8 @@ def test_sessions_are_listed_in_the_order_of_their_recording(coarse: Workspace) 
     assert monday.described
     assert (monday.searched, monday.closures) == (2, len(closures(coarse)))
     assert [s.name for s in list_sessions(coarse, ["tuesday"])] == ["tuesday"]
+    rename_session(coarse, "monday", "zulu")  # still the earlier one
+    assert [s.name for s in list_sessions(coarse)] == ["zulu", "tuesday"]
 
 
 def test_a_session_tells_the_drift_that_its_clouds_showed(coarse: Workspace) -> None:

@@ -68,6 +68,27 @@ def test_a_contradiction_is_refused_with_both_values(
     assert settle(work, load(assignments={key: before})) is not None, "the same value is none"
 
 
+def test_closures_bind_the_settings_of_their_search_though_alignments_are_gone(
+    tmp_path: Path,
+) -> None:
+    work = kept(tmp_path)
+    work.alignments("a", "a").unlink()
+    work.closures.touch()
+    with pytest.raises(SettingsError, match=r"query\.every=4"):
+        settle(work, given(query__every="4"))
+
+
+def test_without_sessions_other_settings_of_maps_take_the_place_of_kept_ones(
+    tmp_path: Path,
+) -> None:
+    work = kept(tmp_path, **ROOM)
+    work.session("a").session_json.unlink()
+    keep(work, given(fusion__voxel_size="0.1").resolved())
+    settings = read_kept(work)
+    assert settings is not None
+    assert settings.resolved().fusion.voxel_size == 0.1
+
+
 def test_a_section_binds_once_tables_depend_on_it(tmp_path: Path) -> None:
     work = kept(tmp_path)
     other = given(descriptor__stride="4"), given(query__every="4"), given(fusion__hit="1")
