@@ -13,6 +13,9 @@ from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.model import PRIOR
 
 LEAST_PAIRS = 4  # fewer tell nothing
+# what a closure would suffer, in voxels: noted above the first, wrong above the second
+NOTED, WRONG = 0.5, 1.0
+NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 LEAST_SIGMAS = 5.0  # standard deviations by which a fault's parameter differs from zero for sure
 # parameters by position, and what a wrong one is called
 NAMES = {

@@ -7,28 +7,34 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.logs.poses.plausibility import implausible
-from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.contradictions import (
+    TELLING,
+    add_contradictions,
+    add_strangers,
+    add_unexplained,
+)
+from semloc_logs.mapping.fit.evident_faults import add_evident_faults
 from semloc_logs.mapping.fit.fault_texts import fault_text
 from semloc_logs.mapping.fit.findings import (
     LEAST_PAIRS,
     LEAST_SIGMAS,
     NAMES,
+    NEAR_VOXELS,
+    NOTED,
+    WRONG,
     Finding,
     SessionFit,
     Severity,
     StreamFit,
 )
-from semloc_logs.mapping.fit.interpolation import interpolation_errors
 from semloc_logs.mapping.fit.keyframe_pairs import (
-    LEAST_SHARE,
     Clouds,
     Registered,
     Start,
@@ -42,7 +48,6 @@ from semloc_logs.mapping.fit.model import (
     CLOCK,
     LEVER,
     LONGEST_OFFSET,
-    MEDIAN_OF_6,
     PARAMETERS,
     ROTATION,
     SCALE,
@@ -74,41 +79,10 @@ AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
 # squared distances in the median beyond which other starts of registration are tried; and up to
 # which faults explain the pairs, more with noisy registrations
 DOUBTFUL = 15.0
-# a pair contradicts its poses when registration brings so many times the points onto planes
-CONTRADICTS = 1.15
-# registrations with a smaller share of points on planes may have ended anywhere; a sensor with few
-# lines has so few on planes everywhere, which tell where it brings far more onto them
-TELLING = 0.2
-FEW_TELLING, FEW_CONTRADICT = 0.08, 1.5
-CONTRADICTION = 50.0  # and its squared distance is larger
-# a camera's clouds move otherwise in the median: voxels, and radians
-MOST_OFF, MOST_TURNED = 2.5, 0.045
-UNEXPLAINED = 30.0  # times the noise of registration, of squared distances in the median
-LEAST_CONTRADICTIONS = 2  # one after the other
-
-# clouds usually have so many times the least share of points on planes of the ones beside them; so
-# many pairs in a row that have less are more than one damaged cloud
-USUALLY_ALIKE, LEAST_STRANGERS = 5.0, 3
-
-# what a closure would suffer, in voxels: noted above the first, wrong above the second
-NOTED, WRONG = 0.5, 1.0
-LATEST_POSES = 5.0  # s; ones that are computed slowly are recorded within two, most of them
-OFTEN = 0.9  # of the keyframes have a smaller error
-FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
-WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
-LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
-STEADY = 0.9  # of the turns of contradicting pairs, summed up, where poses drift to one side
-NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
-
-
-_STUCK_TEXT = (
-    "many of its stamps hardly differ although they were recorded at other times; use the times of"
-    " recording with --set logs.stamps=log"
-)
 
 
 def check_session(session: Session, collected: Collected, voxel: float) -> SessionFit:
@@ -122,108 +96,11 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         span = session.sweep_span_of(topic)
         clouds = Clouds(collected, np.array(rows, np.int64), voxel, span)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
-        # what follows from these would be named with other causes
-        frames = {collected.headers[row].frame_id for row in rows}
-        known = _stuck(session, topic) or _mounting_text(session, frames, voxel)
-        if known:
-            stream.findings = [Finding(Severity.WRONG, known)]
-        if not session.are_poses_fixes:
-            _add_coarse(stream, track, clouds)
-        _add_far_clock(stream, session.shift_of(topic))
-        _add_lead(stream, session.lead_of(topic), clouds)
-        _add_off_stamp(stream, session.off_stamp_of(topic), clouds)
+        add_evident_faults(stream, session, clouds)
         if not stream.is_wrong:
             stream.drift = local_drift(clouds)
         check.streams.append(stream)
     return check
-
-
-def _stuck(session: Session, topic: str) -> str:
-    """A clock that stands still, or a sensor that repeats itself; else empty."""
-    return _STUCK_TEXT if session.is_stuck(topic) else session.repeats(topic)
-
-
-def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
-    """A mounting of ``frames`` that is not in metres, or that changes; else empty."""
-    base_T_sensors = session.base_T_sensors()
-    for frame in sorted(frames & base_T_sensors.keys()):
-        distance = float(np.linalg.norm(base_T_sensors[frame][:3, 3]))
-        if distance > FARTHEST_MOUNTING:
-            return (
-                f"its frame '{frame}' is mounted {distance:.0f} m from '{session.base_frame}': the"
-                " transform is not in metres, or of another vehicle; correct it"
-            )
-        for (parent, child), change in session.mounting_changes(frame).items():
-            if change.distance / voxel + change.angle * NEAR_VOXELS >= WRONG:
-                return (
-                    f"the mounting of '{child}' in '{parent}' is recorded with values that differ"
-                    f" by {change.distance:.2f} m and {np.degrees(change.angle):.1f} degrees: it"
-                    " was calibrated anew, or has two publishers; cut the log there, or give the"
-                    f" right one with --set logs.mountings.{child}=[x,y,z,qx,qy,qz,qw]"
-                )
-    return ""
-
-
-def _add_coarse(stream: StreamFit, track: PoseTrack, clouds: Clouds) -> None:
-    """Poses that are too far apart: errors between them look like a clock."""
-    meters, radians = interpolation_errors(track, clouds.stamps_ns())
-    effects = meters / clouds.voxel + radians * NEAR_VOXELS
-    if not len(effects) or float(np.quantile(effects, OFTEN)) < WRONG:
-        return
-    apart = float(np.median(np.diff(track.stamps_ns))) * 1e-9
-    text = (
-        f"the poses are {apart:.1f} s apart, too far for this drive: between them they are off by"
-        f" up to {meters.max():.1f} m and {np.degrees(radians.max()):.0f} degrees; record poses"
-        " more often, or use --odometry lidar"
-    )
-    stream.findings = [Finding(Severity.WRONG, text)]
-
-
-def _add_far_clock(stream: StreamFit, shift: float) -> None:
-    """Stamps that are farther off beside their recording than the search for a clock reaches.
-
-    What the search found is something else then. No sensor is recorded so late, poses hardly are.
-    """
-    if -LATEST_POSES <= shift <= LONGEST_OFFSET:
-        return
-    side = "earlier" if shift > 0 else "later"
-    text = (
-        f"its stamps are {abs(shift):.2f} s {side} beside their recording than the ones of the"
-        " poses: the clock of one of both is another; give --set logs.time_offset."
-        f"{stream.topic}={shift:+.2f}, or --stamps log"
-    )
-    stream.findings = [Finding(Severity.WRONG, text)]
-
-
-def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
-    """Stamps that are later than their recording are wrong, also where the drive does not show it.
-
-    A steady drive along a street hides a clock.
-    """
-    if stream.findings or lead * clouds.rates[0] < WRONG * clouds.voxel:
-        return
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
-            " poses are not: its clock is another one, or was set; give --set logs.time_offset."
-            f"{stream.topic}={-lead:+.2f} where this holds for the whole log, else cut the log",
-        )
-    )
-
-
-def _add_off_stamp(stream: StreamFit, seconds: float, clouds: Clouds) -> None:
-    """Times of points and of their header that contradict each other, wherever it matters."""
-    if stream.findings or seconds * clouds.rates[0] < WRONG * clouds.voxel:
-        return
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"its points were all measured {seconds:.2f} s or more before or after the stamp of"
-            " their sweep: the stamps or the times of the points are wrong; record sweeps with"
-            " times that agree",
-        )
-    )
 
 
 def check_stream(
@@ -249,49 +126,14 @@ def check_stream(
     # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
     if not stream.findings and not clouds.sees_one_side():
         best = max(tried, key=lambda found: float(found.share.sum()))
-        _contradictions(
+        add_contradictions(
             stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
         )
         if not stream.findings:
-            _strangers(stream, clouds, numbers, given)
+            add_strangers(stream, clouds, numbers, given)
     elif not stream.findings:
-        _unexplained(stream, given, poses_at, clouds)
+        add_unexplained(stream, given, poses_at, clouds)
     return stream
-
-
-def _strangers(
-    stream: StreamFit, clouds: Clouds, numbers: Sequence[tuple[int, int]], given: Registered
-) -> None:
-    """Names the time where clouds fit none beside them, from any start, although most others do."""
-    if float(np.median(given.share)) < USUALLY_ALIKE * LEAST_SHARE:
-        return
-    fitting = {(target, source) for target, source in given.numbers.tolist()}
-    lost = [pair for pair in numbers if pair not in fitting]
-    if not lost:
-        return
-    # of the pairs between the chosen ones, the ones beside these
-    everything = choose(clouds, len(clouds.rows))
-    place = {pair: number for number, pair in enumerate(everything)}
-    beside = {place[pair] + step for pair in lost for step in (-1, 1)}
-    untold = [everything[n] for n in sorted(beside) if 0 <= n < len(everything)]
-    untold = [pair for pair in untold if pair not in numbers]
-    found = registered(clouds, untold).numbers.tolist() if untold else []
-    lost += [pair for pair in untold if list(pair) not in found]
-    rows = np.array(sorted(place[pair] for pair in lost), np.int64)
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    rows = np.concatenate([run for run in runs if len(run) >= LEAST_STRANGERS] or [rows[:0]])
-    if not len(rows):
-        return
-    stamps_ns = clouds.stamps_ns()[np.array([everything[row] for row in rows])]
-    when = time_range(int(stamps_ns.min()), int(stamps_ns.max()))
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"{len(rows)} pairs of its clouds, one after the other, have no surfaces in common"
-            f" ({when}), which the others have: the sensor measured nothing but noise there, or was"
-            " covered; cut the log there",
-        )
-    )
 
 
 def _far_off(
@@ -313,24 +155,6 @@ def _far_off(
         return unknown
     stream = _judged(topic, clouds, poses_at, found)
     return stream if stream.findings else unknown
-
-
-def _unexplained(stream: StreamFit, found: Registered, poses_at: PosesAt, clouds: Clouds) -> None:
-    """Names a camera most of whose pairs move otherwise than the poses, far beyond its noise."""
-    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
-    is_off = stream.translation_m > MOST_OFF * clouds.voxel or stream.rotation_rad > MOST_TURNED
-    usual = float(np.nanmedian(squares))
-    if not is_off or usual < UNEXPLAINED or usual < UNEXPLAINED * noise(clouds, found):
-        return
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"most of its clouds move otherwise than the poses, by {stream.translation_m:.2f} m and"
-            f" {np.degrees(stream.rotation_rad):.1f} degrees in the median of"
-            f" {len(found.pairs)} pairs, and no offset of a clock or a mounting explains it: its"
-            " calibration (CameraInfo, K, baseline, unit of depth) or the poses are wrong",
-        )
-    )
 
 
 def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:
@@ -491,59 +315,3 @@ def _effect(parameters: F64, fault: Fault, clouds: Clouds) -> float:
         return float(np.linalg.norm(parameters[LEVER])) / clouds.voxel
     change = abs(float(np.expm1(parameters[SCALE])))
     return WRONG * change / SCALE_WRONG if change >= SCALE_NOTED else 0.0
-
-
-def _contradictions(
-    stream: StreamFit,
-    found: Registered,
-    poses_at: PosesAt,
-    clouds: Clouds,
-    severity: Severity,
-) -> None:
-    """Names the time where clouds move otherwise than the poses, and nothing else explains it."""
-    predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
-    squares = found.pairs.squares(predicted)
-    off = difference(found.pairs.measured, predicted)
-    meters = np.linalg.norm(off[:, :3], axis=1)
-    radians = np.linalg.norm(off[:, 3:], axis=1)
-    with np.errstate(invalid="ignore"):
-        gain = found.share / np.maximum(found.given_share, 1e-9)
-        is_other = (gain > CONTRADICTS) & (found.share > TELLING)
-        is_other |= (gain > FEW_CONTRADICT) & (found.share > FEW_TELLING)
-        is_other &= squares > CONTRADICTION
-        is_other &= (meters > WRONG * clouds.voxel) | (radians > WRONG_TURN)
-    if not is_other.any():
-        return
-    # where most pairs are off, their median does not show the noise
-    usual = float(np.nanmedian(squares)) / MEDIAN_OF_6
-    excess = max(1.0, min(usual, noise(clouds, found)))
-    rows = np.flatnonzero(is_other & (squares > CONTRADICTION * excess))
-    # single ones are registrations that went wrong
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    rows = np.concatenate([run for run in runs if len(run) >= LEAST_CONTRADICTIONS] or [rows[:0]])
-    if not len(rows):
-        return
-    first = int(found.pairs.stamps_ns[rows].min())
-    last = int(found.pairs.stamps_ns[rows].max())
-    farthest = float(meters[rows].max())
-    most_turned = float(np.degrees(radians[rows].max()))
-    stream.findings.append(
-        Finding(
-            severity,
-            f"{len(rows)} of {len(found.pairs)} pairs of its clouds move otherwise than the poses,"
-            f" by up to {farthest:.1f} m and {most_turned:.0f} degrees ({time_range(first, last)}):"
-            f" the poses are wrong there{_drift_text(off[rows], predicted[rows])}; cut the log, or"
-            " give others with --poses FILE",
-        )
-    )
-
-
-def _drift_text(off: F64, predicted: F64) -> str:
-    """How fast poses drift that turn wrongly everywhere and to the same side; else empty."""
-    way = np.linalg.norm(predicted[:, :3, 3], axis=1).sum()
-    turns = off[:, 3:]
-    together = float(np.linalg.norm(turns.sum(0)))
-    is_steady = together >= STEADY * float(np.linalg.norm(turns, axis=1).sum())
-    if not is_steady or together < LEAST_DRIFT * way:
-        return ""
-    return f", their rotation drifts by {np.degrees(together) / way:.1f} degrees a metre"

@@ -72,6 +72,10 @@ class Clouds:
         """Their stamps (n,)."""
         return np.array([self.collected.headers[r].stamp_ns for r in self.rows], np.int64)
 
+    def frames(self) -> set[str]:
+        """The frames that they were measured in."""
+        return {self.collected.headers[r].frame_id for r in self.rows}
+
     def points(self, number: int) -> F64:
         """Points (n, 3) of a keyframe in the base frame."""
         return self.collected.load(int(self.rows[number]))[0].astype(float)
