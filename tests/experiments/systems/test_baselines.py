@@ -18,8 +18,10 @@ from semloc_logs.experiments.systems.catalogue import (
 def test_every_entry_makes_the_system_of_its_name(
     entry: Entry, options: Any, tmp_path: Path
 ) -> None:
+    folder = tmp_path / entry.name
+    folder.mkdir()
     try:
-        system = make_system(entry, replace(options, folder=tmp_path / entry.name))
+        system = make_system(entry, replace(options, folder=folder))
     except NotInstalledError as problem:
         assert entry.extra
         pytest.skip(str(problem))
