@@ -12,7 +12,6 @@ from semloc_logs.numerics.transforms import apply
 F64 = NDArray[np.float64]
 STRIDE = 3  # of the points that are looked at, which stand for all
 LEVEL = 0.9  # of the normal's height on level ground
-PLANAR = 0.3  # of its surroundings
 LEAST_POINTS = 30
 
 
@@ -31,7 +30,7 @@ def ground_bias(
     met = index >= 0
     index = index[met]
     normal = surface.normals[index]
-    is_level = (np.abs(normal[:, 2]) > LEVEL) & (surface.planar[index] > PLANAR)
+    is_level = (np.abs(normal[:, 2]) > LEVEL) & (surface.planar[index] > 0)
     if int(is_level.sum()) < LEAST_POINTS:
         return np.zeros((3, 6))
 

@@ -43,6 +43,14 @@ class Place:
     submap: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetSurface:
+    """A ``surface`` in the map frame, and the ``keyframes`` (n,) that it is made from."""
+
+    surface: Surface
+    keyframes: I64
+
+
 class Recent(Generic[Cached]):
     """The most recently used values, at most ``size``."""
 
@@ -68,7 +76,7 @@ class Caches:
 
     def __init__(self) -> None:
         self.targets: Recent[Target] = Recent(CACHED_TARGETS)
-        self.surfaces: Recent[Surface] = Recent(CACHED_SURFACES)
+        self.surfaces: Recent[TargetSurface] = Recent(CACHED_SURFACES)
         self.squares: Recent[tuple[I64, F64]] = Recent(CACHED_SQUARES)
         self.keyframes: Recent[Keyframe] = Recent(CACHED_KEYFRAMES)
 

@@ -20,7 +20,7 @@ from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.query import build_query, stretch_of_query, stretch_of_target
+from semloc_logs.closures.query import build_query, query_members, stretch
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.labels.space import cityscapes
@@ -38,6 +38,7 @@ from semloc_logs.words.index import Allowed, LookUp, Matches, look_ups
 from semloc_logs.words.vocabulary import load_vocabulary
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches vote in
 # the weight of a word match falls to LEAST_WEIGHT at so many bits between the words
 FAR_WORD = 32.0
@@ -96,13 +97,15 @@ class Fitted:
     """A candidate after a fit on the points.
 
     ``nearest`` is the target's keyframe nearest to it, ``view`` (3,) where the query looks, in the
-    target's map; ``range_sigma`` the median standard deviation of points along their rays, metres,
-    of the query or of the target's surface, whichever is larger.
+    target's map, ``keyframes`` (n,) of it that saw this; ``range_sigma`` the median standard
+    deviation of points along their rays, metres, of the query or of the target's surface, whichever
+    is larger.
     """
 
     candidate: Candidate
     nearest: int
     view: F64
+    keyframes: I64
     fit: Fit
     scores: MutualScores
     range_sigma: float
@@ -307,12 +310,14 @@ def _coarse(context: QueryContext, candidate: Candidate) -> Fitted:
     query = context.query
     group = candidate.group
     target = visible.target(group)
+    view = apply(candidate.target_T_query, query.view_centre[None])[0]
     fit = coarse_fit(candidate, target, query)
     fit = escaped(fit, candidate, target, query, context.settings.descriptor.headings)
     return Fitted(
         candidate,
         visible.nearest_keyframe(group, candidate.target_T_query[:3, 3]),
-        apply(candidate.target_T_query, query.view_centre[None])[0],
+        view,
+        np.array([visible.viewing_keyframe(group, view)]),
         fit,
         mutual_scores(query, target, fit.target_T_query),
         query.sigma,
@@ -330,10 +335,12 @@ def _fine(context: QueryContext, fitted: Fitted, best_score: float) -> Fitted:
     start = fitted.fit.target_T_query
     if fitted.scores.score < max(MIN_RELATIVE_SCORE * best_score, MIN_SCORE):
         return replace(fitted, fit=measured(start, target.surface, query))
-    surface = target_surface(context.visible, group, fitted.view)
+    around = target_surface(context.visible, group, fitted.view)
+    surface = around.surface
     fit = fine_fit(start, surface, query)
     return replace(
         fitted,
+        keyframes=around.keyframes,
         fit=fit,
         scores=mutual_scores(query, target, fit.target_T_query),
         range_sigma=max(query.sigma, surface.sigma),
@@ -362,8 +369,7 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
     map_T_query_base = fitted.fit.target_T_query @ context.query_T_base
     nearest = visible.nearest_keyframe(group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
-    viewing = visible.viewing_keyframe(group, fitted.view)
-    count = context.settings.closures.surface_keyframes
+    members = query_members(session, context.keyframe, context.settings)
     return Alignment(
         query_session=session.folder.name,
         target_session=target_session.folder.name,
@@ -377,8 +383,8 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
             map_T_query_base,
             map_T_target,
             context.voxel_size,
-            stretch_of_query(session, context.keyframe, context.settings),
-            stretch_of_target(target_session, nearest, viewing, count),
+            stretch(session, context.keyframe, members),
+            stretch(target_session, nearest, fitted.keyframes),
             uncertain=is_uncertain(fitted.range_sigma, context.voxel_size),
         ),
         overlap=overlap,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import Fuser
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 CACHED_KEYFRAMES = 64  # in memory: a query of 20 m and the next one
 POINTS_A_VOXEL = 2  # of a query along each edge
 
@@ -54,17 +57,10 @@ def query_members(session: SessionMap, keyframe: int, settings: Resolved) -> lis
     return [i for i in range(first, first + count) if distance[i] <= settings.query.radius]
 
 
-def stretch_of_query(session: SessionMap, keyframe: int, settings: Resolved) -> Stretch:
-    """The road that the query at ``keyframe`` was driven along."""
-    members = query_members(session, keyframe, settings)
-    return Stretch.between(session.distance[members] - session.distance[keyframe], session.drift)
-
-
-def stretch_of_target(session: SessionMap, keyframe: int, viewing: int, count: int) -> Stretch:
-    """The road of the ``count`` keyframes nearest to the ``viewing`` one, from ``keyframe`` on."""
-    away = np.abs(session.distance - session.distance[viewing])
-    members = np.argsort(away, kind="stable")[:count]
-    return Stretch.between(session.distance[members] - session.distance[keyframe], session.drift)
+def stretch(session: SessionMap, keyframe: int, members: Sequence[int] | I64) -> Stretch:
+    """The road from ``keyframe`` to the ``members`` that a map is made from."""
+    offsets = session.distance[np.asarray(members, np.int64)] - session.distance[keyframe]
+    return Stretch.between(offsets, session.drift)
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple[Query, F64]:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.target_map import is_uncertain, point_surface
-from semloc_logs.closures.database import SQUARE_VOXELS
+from semloc_logs.closures.database import SQUARE_VOXELS, TargetSurface
 from semloc_logs.closures.visibility import REACH, Visibility
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.voxels.store import Keyframe
@@ -45,8 +44,8 @@ class _Surroundings:
         return database.keyframe(self.group, number).near(centre, radius), origin
 
 
-def target_surface(visible: Visibility, group: int, position: F64) -> Surface:
-    """The surface around ``position`` (3,), in the map frame.
+def target_surface(visible: Visibility, group: int, position: F64) -> TargetSurface:
+    """The surface around ``position`` (3,).
 
     It is made from the keyframe of a submap, or beside it, that looks there, and from those about
     it, as far along the road as a query is long.
@@ -77,16 +76,18 @@ def _middle(visible: Visibility, group: int, ids: I64, position: F64) -> int:
     return int(together[len(together) // 2])
 
 
-def _surface(surroundings: _Surroundings) -> Surface:
+def _surface(surroundings: _Surroundings) -> TargetSurface:
     session = surroundings.visible.database.session(surroundings.group)
     clouds = []
     spreads = []
-    for i in _chosen(surroundings).tolist():
+    keyframes = _chosen(surroundings)
+    for i in keyframes.tolist():
         frame, origin = surroundings.near(i)
         clouds.append(apply(session.map_T_base[i], frame.points))
         spreads.append(frame.spread(origin) @ session.map_T_base[i][:3, :3].T)
     voxel_size = surroundings.visible.database.settings.fusion.voxel_size
-    return point_surface(np.concatenate(clouds), np.concatenate(spreads), voxel_size)
+    surface = point_surface(np.concatenate(clouds), np.concatenate(spreads), voxel_size)
+    return TargetSurface(surface, keyframes)
 
 
 def _chosen(surroundings: _Surroundings) -> I64:

@@ -47,7 +47,7 @@ def fitted(x: float, score: float) -> Fitted:
     fit = Fit(yaw_transform(0.0, (x, 0, 0)), 1.0, 100, 0.1, none, np.zeros(3), np.zeros((2, 6)))
     scores = Scores(100, 100, round(100 * score), 0)
     both = MutualScores(scores, scores)
-    return Fitted(Candidate(0, np.eye(4), 0.5, 3), 0, np.zeros(3), fit, both, 0.0)
+    return Fitted(Candidate(0, np.eye(4), 0.5, 3), 0, np.zeros(3), np.zeros(1, int), fit, both, 0.0)
 
 
 def test_the_best_fit_of_each_place_is_kept() -> None:

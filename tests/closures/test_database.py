@@ -197,7 +197,7 @@ def test_beyond_the_end_of_a_drive_a_surface_has_what_was_seen_from_afar(tmp_pat
     )
     database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
     at_the_end, beyond = (
-        target_surface(everything(database), 0, np.array([x, 0.0, 0.0])).points[:, 0].max()
+        target_surface(everything(database), 0, np.array([x, 0.0, 0.0])).surface.points[:, 0].max()
         for x in (36.0, 70.0)
     )
     assert at_the_end == 36.0  # of each keyframe what lies within 28.8 m of it
@@ -212,7 +212,7 @@ def test_a_surface_is_made_from_so_many_keyframes(tmp_path: Path) -> None:
     def heights(count: int) -> list[int]:
         settings = Settings.model_validate({"closures": {"surface_keyframes": count}}).resolved()
         database = Database(Workspace(tmp_path), ("a",), settings)
-        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW).surface
         return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
 
     assert heights(1) == [5]
@@ -228,7 +228,7 @@ def test_a_surface_of_a_long_query_has_so_many_keyframes_for_each_radius(tmp_pat
     def heights(length: float) -> list[int]:
         given = {"closures": {"surface_keyframes": 3}, "query": {"length": length}}
         database = Database(Workspace(tmp_path), ("a",), Settings.model_validate(given).resolved())
-        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW).surface
         return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
 
     assert heights(20.0) == [3, 5, 7]  # three of five: less than a radius, 24 m

@@ -400,7 +400,7 @@ def fitted(score: float, x: float = 0.0, degrees: float = 0.0) -> Fitted:
     fit = Fit(T, 1.0, 1000, 0.1, np.eye(6), np.zeros(3), np.zeros((2, 6)))
     scores = Scores(1000, 1000, round(1000 * score), 0)
     both = MutualScores(scores, scores)
-    return Fitted(Candidate(0, T, score, 1), 0, np.zeros(3), fit, both, 0.0)
+    return Fitted(Candidate(0, T, score, 1), 0, np.zeros(3), np.zeros(1, int), fit, both, 0.0)
 
 
 def test_each_place_is_kept_once_and_the_best_first() -> None:

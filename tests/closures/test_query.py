@@ -13,8 +13,7 @@ from semloc_logs.closures.query import (
     build_query,
     query_keyframes,
     query_members,
-    stretch_of_query,
-    stretch_of_target,
+    stretch,
 )
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.mapping.selection import road_distance
@@ -209,18 +208,12 @@ def test_points_of_a_camera_keep_their_spread(tmp_path: Path) -> None:
     assert query.sigma == pytest.approx(0.2, abs=1e-4)
 
 
-def test_the_stretch_of_a_query_begins_at_its_pose(tmp_path: Path) -> None:
-    """Keyframes 1 m apart: two on either side of the middle one; all four ahead of the first."""
+def test_a_stretch_leads_from_a_pose_to_what_its_map_is_made_from(tmp_path: Path) -> None:
+    """Keyframes 1 m apart: two on either side; all four ahead; three of them 5 to 7 m ahead."""
     s = session(tmp_path, straight(12, 1.0))
-    middle = stretch_of_query(s, 6, settings())
-    assert middle.road == pytest.approx(np.sqrt(SPREAD_SHARE * 2.0))
-    first = stretch_of_query(s, 0, settings())
-    assert first.road == pytest.approx(np.sqrt(2.0**2 + SPREAD_SHARE * 2.0))
-
-
-def test_the_stretch_of_a_target_leads_from_its_pose_to_where_it_was_seen(tmp_path: Path) -> None:
-    """Seen from keyframes 7 to 9, the pose at 2: 6 m ahead."""
-    s = session(tmp_path, straight(12, 1.0))
-    seen = stretch_of_target(s, 2, 8, 3)
+    assert stretch(s, 6, [4, 5, 6, 7, 8]).road == pytest.approx(np.sqrt(SPREAD_SHARE * 2.0))
+    ahead = stretch(s, 0, [0, 1, 2, 3, 4])
+    assert ahead.road == pytest.approx(np.sqrt(2.0**2 + SPREAD_SHARE * 2.0))
+    seen = stretch(s, 2, np.array([7, 8, 9]))
     assert seen.road == pytest.approx(np.sqrt(6.0**2 + SPREAD_SHARE * 2.0 / 3.0))
-    assert stretch_of_target(s, 8, 8, 1).road == 0.0
+    assert stretch(s, 8, [8]).road == 0.0

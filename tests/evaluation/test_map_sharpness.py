@@ -27,7 +27,7 @@ def test_two_walls_are_as_thick_as_they_are_apart(apart: float) -> None:
     np.testing.assert_allclose(thickness, apart / 2, atol=2e-3)
 
 
-def test_walls_far_apart_are_no_plane() -> None:
+def test_walls_far_apart_are_not_a_plane() -> None:
     """0.4 m apart within a cell of 1 m: thicker than a third of the width."""
     cells, thickness = plane_figures([wall(0.3, 1), wall(0.7, 2)], 1.0)
     assert (cells, len(thickness)) == (16, 0)

@@ -9,7 +9,6 @@ from collections.abc import Set
 
 import numpy as np
 
-from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.fit.findings import (
     NEAR_VOXELS,
@@ -32,14 +31,16 @@ _STUCK_TEXT = (
 
 
 def add_evident_faults(stream: StreamFit, session: Session, clouds: Clouds) -> None:
-    """Enters them, in the place of what they would cause."""
+    """Enters them, the first one in the place of what it would cause."""
     topic = stream.topic
-    known = _stuck(session, topic) or _mounting_text(session, clouds.frames(), clouds.voxel)
-    if known:
-        stream.findings = [Finding(Severity.WRONG, known)]
-    if not session.are_poses_fixes:
-        _coarse_poses(stream, session.track, clouds)
-    _far_clock(stream, session.shift_of(topic))
+    cause = (
+        _stuck(session, topic)
+        or _mounting_text(session, clouds.frames(), clouds.voxel)
+        or _far_clock_text(topic, session.shift_of(topic))
+        or _coarse_poses_text(session, clouds)
+    )
+    if cause:
+        stream.findings = [Finding(Severity.WRONG, cause)]
     _lead(stream, session.lead_of(topic), clouds)
     _off_stamp(stream, session.off_stamp_of(topic), clouds)
 
@@ -70,35 +71,45 @@ def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
     return ""
 
 
-def _coarse_poses(stream: StreamFit, track: PoseTrack, clouds: Clouds) -> None:
-    """Poses that are too far apart: errors between them look like a clock."""
+def _coarse_poses_text(session: Session, clouds: Clouds) -> str:
+    """Poses that are too far apart: errors between them look like a clock. Else empty.
+
+    Fixes scatter, which is not an error between them.
+    """
+    if session.are_poses_fixes:
+        return ""
+    track = session.track
     meters, radians = interpolation_errors(track, clouds.stamps_ns())
     effects = meters / clouds.voxel + radians * NEAR_VOXELS
     if not len(effects) or float(np.quantile(effects, OFTEN)) < WRONG:
-        return
+        return ""
     apart = float(np.median(np.diff(track.stamps_ns))) * 1e-9
-    text = (
+    return (
         f"the poses are {apart:.1f} s apart, too far for this drive: between them they are off by"
         f" up to {meters.max():.1f} m and {np.degrees(radians.max()):.0f} degrees; record poses"
         " more often, or use --odometry lidar"
     )
-    stream.findings = [Finding(Severity.WRONG, text)]
 
 
-def _far_clock(stream: StreamFit, shift: float) -> None:
+def _far_clock_text(topic: str, shift: float) -> str:
     """Stamps that are farther off beside their recording than the search for a clock reaches.
 
     What the search found is something else then. No sensor is recorded so late, poses hardly are.
+    Else empty.
     """
     if -LATEST_POSES <= shift <= LONGEST_OFFSET:
-        return
+        return ""
     side = "earlier" if shift > 0 else "later"
-    text = (
-        f"its stamps are {abs(shift):.2f} s {side} beside their recording than the ones of the"
-        " poses: the clock of one of both is another; give --set logs.time_offset."
-        f"{stream.topic}={shift:+.2f}, or --stamps log"
+    # the stamps' own problem tells how to mend larger ones
+    remedy = (
+        "correct the stamps of one of both"
+        if abs(shift) > LATEST_POSES
+        else f"give --set logs.time_offset.{topic}={shift:+.2f}, or --stamps log"
     )
-    stream.findings = [Finding(Severity.WRONG, text)]
+    return (
+        f"its stamps are {abs(shift):.2f} s {side} beside their recording than the ones of the"
+        f" poses: the clock of one of both is another; {remedy}"
+    )
 
 
 def _lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:

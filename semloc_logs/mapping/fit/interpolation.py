@@ -15,12 +15,17 @@ from semloc_logs.logs.poses.track import PoseTrack
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 _FEWEST = 5  # poses that show how the motion changes
+# s: between poses nearer than this no vehicle is far off, and their noise looks like a motion
+_SHORT = 0.3
+# of the longer time to a neighbour is the shorter one at least: poses in bursts show their noise
+_EVEN = 0.5
 
 
 def interpolation_errors(track: PoseTrack, stamps_ns: I64) -> tuple[F64, F64]:
     """Errors (n,) of the positions (m) and the rotations (rad) at ``stamps_ns`` (n,).
 
-    0 at the stamp of a pose, outside of the poses, and where gaps leave too few poses.
+    0 at the stamp of a pose, outside of the poses, where gaps leave too few of them, and between
+    poses that follow each other soon or come in bursts.
     """
     meters = np.zeros(len(stamps_ns))
     radians = np.zeros(len(stamps_ns))
@@ -32,7 +37,8 @@ def interpolation_errors(track: PoseTrack, stamps_ns: I64) -> tuple[F64, F64]:
     left = left[rows]
     before = (stamps_ns[rows] - stamps[left]) * 1e-9
     after = (stamps[left + 1] - stamps_ns[rows]) * 1e-9
-    is_within = before + after <= track.gap_limit_ns() * 1e-9
+    apart = before + after
+    is_within = (apart <= track.gap_limit_ns() * 1e-9) & (apart >= _SHORT)
     needed = np.unique(np.clip(np.concatenate([left, left + 1]), 1, len(stamps) - 2))
     bends = _bends(track, needed)
     of_both = [
@@ -46,11 +52,15 @@ def interpolation_errors(track: PoseTrack, stamps_ns: I64) -> tuple[F64, F64]:
 
 
 def _bends(track: PoseTrack, poses: I64) -> F64:
-    """Half of the second derivatives (n, 2) at poses (n,): m/s^2, rad/s^2; 0 beside a gap."""
+    """Half of the second derivatives (n, 2) at poses (n,): m/s^2, rad/s^2; 0 beside a gap, and in
+    a burst.
+    """
     stamps = track.stamps_ns
     before = (stamps[poses] - stamps[poses - 1]) * 1e-9
     after = (stamps[poses + 1] - stamps[poses]) * 1e-9
-    is_known = np.maximum(before, after) <= track.gap_limit_ns() * 1e-9
+    longer = np.maximum(before, after)
+    is_known = longer <= track.gap_limit_ns() * 1e-9
+    is_known &= np.minimum(before, after) >= _EVEN * longer
     bends = []
     written = track.poses
     for steps in (_moves, _turns):

@@ -20,15 +20,18 @@ WAY = 40.0  # voxels between both keyframes: about the road of a query
 LONGEST_WAY = 1.5  # of it: where keyframes are sparse, or poses jump
 PAIRS = 16
 LEAST_PAIRS = 8
+LOOKED_AT = 64  # keyframes that pairs are looked for at
+LONGEST_NS = 3_000_000_000  # from keyframe to keyframe: in a gap poses may have jumped
 # registrations that differ there and back by more than so many times the usual went wrong
 AGREE = 3.0
+JUMP = 4.0  # times the usual change of a pair: poses were corrected there
 # of the way: registrations of more noise than this tell less than is known anyway
 MOST_NOISE = 0.003
 
 
 def local_drift(clouds: Clouds) -> Drift | None:
     """The drift of the poses of one stream's keyframes; None where these do not show it."""
-    numbers = _apart(clouds)
+    numbers = apart(clouds)
     registrar = Registrar(clouds)
     met = []
     for target, source in numbers:
@@ -48,7 +51,9 @@ def drift_of(given: F64, there: F64, back: F64) -> Drift | None:
     off = np.stack([difference(there, given), difference(back, given)])
     noise = 0.5 * (off[0] - off[1])
     lengths = np.linalg.norm(noise[:, :3], axis=1)
-    agree = lengths <= AGREE * np.median(lengths)
+    changes = np.linalg.norm(off.mean(0)[:, :3], axis=1)
+    usual = np.median(lengths)
+    agree = (lengths <= AGREE * usual) & (changes <= JUMP * np.median(changes) + usual)
     way = float(np.sqrt(np.mean(np.sum(given[agree, :3, 3] ** 2, axis=1))))
     noise_squares = np.mean(noise[agree] ** 2, axis=0)
     if float(np.sqrt(noise_squares[:3].max())) > MOST_NOISE * way:
@@ -59,7 +64,7 @@ def drift_of(given: F64, there: F64, back: F64) -> Drift | None:
     return Drift.of(np.sqrt(np.maximum(squares - noise_squares, 0.0) + unknown) / way)
 
 
-def _apart(clouds: Clouds) -> list[tuple[int, int]]:
+def apart(clouds: Clouds) -> list[tuple[int, int]]:
     """Numbers of the target and the source of at most :data:`PAIRS` pairs, evenly spread."""
     way = WAY * clouds.voxel
     poses = [clouds.pose(number) for number in range(len(clouds.rows))]
@@ -68,9 +73,13 @@ def _apart(clouds: Clouds) -> list[tuple[int, int]]:
         return []
     positions = np.array([pose[:3, 3] for pose in poses if pose is not None])
     chosen = []
-    for k, target in enumerate(known):
-        lengths = np.linalg.norm(positions[k + 1 :] - positions[k], axis=1)
-        apart = np.flatnonzero(lengths >= way)
-        if len(apart) and lengths[apart[0]] <= LONGEST_WAY * way:
-            chosen.append((target, known[k + 1 + int(apart[0])]))
+    stamps_ns = clouds.stamps_ns()[known]
+    breaks = np.flatnonzero(np.diff(stamps_ns) > LONGEST_NS) + 1
+    ends = np.append(breaks, len(known))  # of the stretches without a gap
+    for k in evenly(len(known), LOOKED_AT).tolist():
+        end = int(ends[np.searchsorted(ends, k, side="right")])
+        lengths = np.linalg.norm(positions[k + 1 : end] - positions[k], axis=1)
+        far = np.flatnonzero(lengths >= way)
+        if len(far) and lengths[far[0]] <= LONGEST_WAY * way:
+            chosen.append((known[k], known[k + 1 + int(far[0])]))
     return [chosen[i] for i in evenly(len(chosen), PAIRS)]

@@ -29,9 +29,25 @@ def test_the_error_on_a_circle_is_the_sagitta_of_the_chord() -> None:
     middle = 10.0 * (1.0 - np.cos(0.25))
     assert meters == pytest.approx([0.0, 0.75 * middle, middle, 0.0, 0.0], abs=0.01)
     assert radians == pytest.approx(0.0, abs=1e-6)
-    # four times as often: a sixteenth
-    meters, _ = interpolation_errors(circle(0.25), np.array([5.125 * SECOND], np.int64))
-    assert meters[0] == pytest.approx(middle / 16.0, abs=0.001)
+    # twice as often: a quarter
+    meters, _ = interpolation_errors(circle(0.5), np.array([5.25 * SECOND], np.int64))
+    assert meters[0] == pytest.approx(middle / 4.0, abs=0.005)
+
+
+@pytest.mark.parametrize("apart", [0.1, 1.0])
+def test_noise_of_poses_in_pairs_is_taken_for_no_motion(apart: float) -> None:
+    """Pairs of poses 1 ms apart with 5 mm of noise, on a straight way."""
+    rng = np.random.default_rng(1)
+    track = PoseTrack()
+    for seconds in np.arange(0.0, 20.0, apart):
+        for later in (0.0, 1e-3):
+            place = np.array([5.0 * (seconds + later), 0.0, 0.0]) + rng.normal(0, 5e-3, 3)
+            pose = yaw_transform(float(rng.normal(0, 5e-4)), (place[0], place[1], place[2]))
+            track.append(round((seconds + later) * SECOND), pose)
+    stamps = (np.arange(2.0, 18.0, 0.37) * SECOND).astype(np.int64)
+    meters, radians = interpolation_errors(track, stamps)
+    assert meters.max() < 0.05
+    assert radians.max() < 0.01
 
 
 def test_a_vehicle_that_swings_is_off_in_its_rotation() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.findings import SessionFit, StreamFit
-from semloc_logs.mapping.fit.local_drift import drift_of, local_drift
+from semloc_logs.mapping.fit.local_drift import apart, drift_of, local_drift
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse
 
@@ -75,11 +75,43 @@ def test_too_short_a_drive_shows_no_drift(tmp_path: Path, streets: SimpleNamespa
 def test_clouds_that_do_not_meet_show_no_drift(
     tmp_path: Path, streets: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A registration without a plane stays where it began, which is no proof of it."""
+    """A registration without a plane stays where it began, which proves nothing."""
     clouds, _ = streets.drive(tmp_path, seconds=25.0)
     ball = np.random.default_rng(0).normal(0, 0.3, (500, 3))
     monkeypatch.setattr(Collected, "load", lambda self, k: (ball + 100.0 * k, None, None))
     assert local_drift(clouds) is None
+
+
+def stepped(at: int) -> SimpleNamespace:
+    """Poses that step aside by 0.5 m at one of them, as where a map was corrected."""
+
+    def written(poses: F64) -> F64:
+        out = poses.copy()
+        out[at:, 1, 3] += 0.5
+        return out
+
+    return SimpleNamespace(written=written)
+
+
+def test_a_step_of_the_poses_is_not_taken_for_drift(
+    tmp_path: Path, streets: SimpleNamespace
+) -> None:
+    clouds, _ = streets.drive(tmp_path, as_written=stepped(130).written, seconds=40.0)
+    drift = local_drift(clouds)
+    assert drift is not None
+    assert max(drift.translation) < 1e-3
+
+
+def test_pairs_do_not_lead_across_a_gap(
+    tmp_path: Path, streets: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the keyframes are ten minutes later, 1 m aside: as many pairs on either side."""
+    clouds, _ = streets.drive(tmp_path, as_written=stepped(250).written, seconds=25.0)
+    half = int(np.searchsorted(clouds.stamps_ns(), 13_500_000_000))
+    later = clouds.stamps_ns() + np.where(np.arange(len(clouds.rows)) < half, 0, 600 * 10**9)
+    monkeypatch.setattr(type(clouds), "stamps_ns", lambda self: later)
+    for target, source in apart(clouds):
+        assert (target < half) == (source < half)
 
 
 def given_and_registered(noise: float, wrong: int = 0) -> tuple[F64, F64, F64]:
@@ -100,7 +132,7 @@ def given_and_registered(noise: float, wrong: int = 0) -> tuple[F64, F64, F64]:
 
 
 @pytest.mark.parametrize(("noise", "wrong"), [(0.0, 0), (0.5, 0), (0.5, 40)])
-def test_noise_of_registrations_is_no_drift(noise: float, wrong: int) -> None:
+def test_noise_of_registrations_is_not_taken_for_drift(noise: float, wrong: int) -> None:
     drift = drift_of(*given_and_registered(noise, wrong))
     assert drift is not None
     np.testing.assert_allclose([*drift.translation, *drift.rotation], RATES, rtol=0.15)
