@@ -112,11 +112,10 @@ def _remove_lock(work: Workspace, path: Path) -> None:
 
 
 def _clear(work: Workspace, paths: Iterable[Path]) -> None:
-    """WorkspaceError where somebody has one of the locks; locks of pairs are removed."""
+    """Remove locks, as who has the gate may. WorkspaceError where somebody has one of them."""
     for path in paths:
         with _locked(work, _name(work, path), 0.0):  # nobody has it
-            if path.parent != work.locks:
-                path.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 def _name(work: Workspace, path: Path) -> str:

@@ -35,6 +35,10 @@ def of_another_map(path: Path) -> None:
     write_json(path, read_json(path) | {"fingerprint": "0" * 16})
 
 
+def without_settings(path: Path) -> None:
+    write_json(path, {})
+
+
 def test_a_whole_workspace_has_no_faults(coarse: Workspace) -> None:
     result = examine(coarse)
     assert result.findings == ()
@@ -80,6 +84,7 @@ def test_a_whole_workspace_has_no_faults(coarse: Workspace) -> None:
             "damaged",
             "semloc close",
         ),
+        ("workspace.json", without_settings, "of another version", "rm .*workspace.json$"),
         ("closures.parquet", cut_off, "cannot be read", "semloc close .* --overwrite"),
         ("rejected.parquet", Path.unlink, "is missing", "semloc close .* --overwrite"),
     ],

@@ -11,16 +11,17 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
-from semloc_logs.errors import WorkspaceError
+from semloc_logs.errors import TemporaryError, WorkspaceError
 from semloc_logs.stages import lock
-from semloc_logs.stages.lock import writing
+from semloc_logs.stages.lock import searching, writing
 from semloc_logs.workspace import Workspace
 
 WRITER = """
@@ -85,6 +86,71 @@ def test_different_sessions_are_made_at_once(
         wednesday = writing(work, ["wednesday"])
         with pytest.raises(WorkspaceError, match="work is being written by process"), wednesday:
             pass
+
+
+def test_who_searches_a_pair_keeps_its_sessions(tmp_path: Path) -> None:
+    """Locks of the same process count, too: each is taken anew."""
+    work = Workspace(tmp_path / "work")
+    with searching(work, "tuesday", "monday"):
+        with searching(work, "tuesday", "tuesday"):
+            pass
+        for sessions in (["monday"], ["tuesday"], None):
+            refused = pytest.raises(TemporaryError, match="query=tuesday/target=monday")
+            with refused, writing(work, sessions):
+                pass
+        refused = pytest.raises(TemporaryError, match="alignments/query=tuesday/target=monday")
+        with refused, searching(work, "tuesday", "monday"):
+            pass
+        with writing(work, ["wednesday"]):
+            pass
+        assert work.pair_locks() == [work.pair_lock("tuesday", "monday")]
+    assert work.pair_locks() == []
+    with writing(work), searching(work, "tuesday", "monday"):
+        pass
+    assert work.pair_locks() == []
+
+
+def test_a_session_that_is_made_is_not_searched(tmp_path: Path) -> None:
+    work = Workspace(tmp_path / "work")
+    with writing(work, ["monday"]):
+        for query, target in (("monday", "tuesday"), ("tuesday", "monday")):
+            refused = pytest.raises(TemporaryError, match="Session 'monday' of")
+            with refused, searching(work, query, target):
+                pass
+        with searching(work, "wednesday", "tuesday"):
+            pass
+    with searching(work, "tuesday", "monday"):
+        pass
+
+
+def test_one_that_begins_waits_until_another_has_begun(tmp_path: Path) -> None:
+    """The whole workspace is not waited for: who has it may work for hours."""
+    work = Workspace(tmp_path / "work")
+    work.locks.mkdir(parents=True)
+    gate = FileLock(work.locks / "workspace.lock", thread_local=False)
+    gate.acquire()
+    with pytest.raises(TemporaryError, match="work is being written by"), writing(work):
+        pass
+    begun = threading.Timer(0.3, gate.release)
+    begun.start()
+    with writing(work, ["monday"]):
+        assert not gate.is_locked
+    begun.join()
+
+
+@pytest.mark.parametrize("sessions", [None, ["monday"]])
+def test_a_session_whose_writer_was_killed_is_put_back(
+    tmp_path: Path, sessions: Sequence[str] | None
+) -> None:
+    """Before the work begins, and once more at its end: of another host, the writer is gone."""
+    work = Workspace(tmp_path / "work")
+    session = work.session("monday").path
+    replaced = session.with_name(".monday.elsewhere-1-2-3.old.tmp")
+    replaced.mkdir(parents=True)
+    with writing(work, sessions):
+        assert list(session.parent.iterdir()) == [session]
+        session.rename(replaced)
+    assert list(session.parent.iterdir()) == [session]
 
 
 def test_a_writer_may_enter_again(tmp_path: Path) -> None:

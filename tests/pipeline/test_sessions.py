@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -35,6 +36,12 @@ def test_sessions_are_listed_in_the_order_of_their_recording(coarse: Workspace) 
     assert [s.name for s in list_sessions(coarse, ["tuesday"])] == ["tuesday"]
     rename_session(coarse, "monday", "zulu")  # still the earlier one
     assert [s.name for s in list_sessions(coarse)] == ["zulu", "tuesday"]
+
+
+def test_a_closure_within_a_session_counts_once(coarse: Workspace) -> None:
+    ends = {"query_session": ["monday", "tuesday"], "target_session": ["monday", "monday"]}
+    pq.write_table(pa.table(ends), coarse.closures)
+    assert [(s.name, s.closures) for s in list_sessions(coarse)] == [("monday", 2), ("tuesday", 1)]
 
 
 def test_a_session_tells_the_drift_that_its_clouds_showed(coarse: Workspace) -> None:
@@ -77,9 +84,12 @@ def test_a_name_that_is_taken_is_refused(coarse: Workspace, tools: SimpleNamespa
 
 
 def test_of_a_removed_session_nothing_is_left(coarse: Workspace) -> None:
+    coarse.search_parts("tuesday", "monday").mkdir(parents=True)  # a search was interrupted
     remove_session(coarse, "tuesday")
     assert [s.name for s in coarse.sessions()] == ["monday"]
     assert closures(coarse) == []
     assert not [p for p in coarse.path.rglob("*") if "tuesday" in str(p.relative_to(coarse.path))]
+    coarse.picture.touch()
     remove_session(coarse, "monday")
     assert coarse.sessions() == []
+    assert {p.name for p in coarse.path.iterdir() if p.is_file()} == {"workspace.json"}

@@ -15,8 +15,7 @@ from click.testing import CliRunner, Result
 from semloc_logs.cli.main import program
 from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.engines import Serial
-from semloc_logs.errors import SettingsError, TemporaryError, WorkspaceError
-from semloc_logs.stages.lock import searching, writing
+from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.stages.tasks import Stage, do_task, list_tasks, parse_task
 from semloc_logs.workspace import Workspace
 
@@ -152,25 +151,6 @@ def test_exit_codes_tell_what_to_try_again(coarse: Workspace, tmp_path: Path) ->
         other.wait()
     assert busy.exit_code == 75
     assert "Session 'monday'" in busy.stderr
-
-
-def test_who_searches_a_pair_keeps_its_sessions(coarse: Workspace) -> None:
-    """Locks of the same process count, too: each is taken anew."""
-    with searching(coarse, "tuesday", "monday"):
-        with searching(coarse, "tuesday", "tuesday"):
-            pass
-        for sessions in (["monday"], ["tuesday"], None):
-            refused = pytest.raises(TemporaryError, match="query=tuesday/target=monday")
-            with refused, writing(coarse, sessions):
-                pass
-        refused = pytest.raises(TemporaryError, match="alignments/query=tuesday/target=monday")
-        with refused, searching(coarse, "tuesday", "monday"):
-            pass
-        with writing(coarse, ["wednesday"]):
-            pass
-    with writing(coarse), searching(coarse, "tuesday", "monday"):
-        pass
-    assert coarse.pair_locks() == []
 
 
 def test_parts_of_a_killed_task_are_used(
