@@ -138,6 +138,16 @@ def test_one_that_begins_waits_until_another_has_begun(tmp_path: Path) -> None:
     begun.join()
 
 
+def test_who_has_a_workspace_removes_the_locks_that_others_left(tmp_path: Path) -> None:
+    work = Workspace(tmp_path / "work")
+    left = [work.session_lock("monday"), work.pair_lock("tuesday", "monday")]
+    left[1].parent.mkdir(parents=True)
+    for path in left:
+        path.touch()
+    with writing(work):
+        assert list(work.locks.rglob("*.lock")) == [work.locks / "workspace.lock"]
+
+
 @pytest.mark.parametrize("sessions", [None, ["monday"]])
 def test_a_session_whose_writer_was_killed_is_put_back(
     tmp_path: Path, sessions: Sequence[str] | None
