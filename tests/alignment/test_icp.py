@@ -266,6 +266,7 @@ def test_stiffness_by_hand() -> None:
     information[4, 4] = np.inf  # one number that is none makes the whole useless
     assert stiffness(held(information)) == 0.0
     assert stiffness(held(np.diag([5.0, 4.0, 0.0, 2.0, 7.0, 7.0]))) == 0.0
+    assert stiffness(held(np.diag([5.0, 4.0, 9.0, 2.0, 7.0, 0.0]))) == 0.0  # not solvable
 
 
 def test_covariance_of_a_fit_that_knows_nothing_is_what_the_search_allows() -> None:
@@ -619,3 +620,30 @@ def test_without_level_ground_none_is_off() -> None:
     points = ground_and_walls(rng, 0.0)[6000:]
     surface = surface_of(points, CELL)
     assert not ground_bias(points, surface, np.eye(4), np.zeros(3), 0.45, 0.12).any()
+
+
+def test_ground_bias_by_hand() -> None:
+    """Level ground at four corners of 4 m by 2 m, 10 m ahead, and beside it what is no plane.
+
+    A query lies 6 cm above it, as much as the kernel of a radius of 40 cm is wide: a weight of a
+    half. Ten points at each corner are looked at, which stand for thirty.
+    """
+    corners = np.array([[8.0, -1, 0], [8, 1, 0], [12, -1, 0], [12, 1, 0], [10, 5, 0]])
+    surface = surface_of(corners, CELL)
+    is_flat = surface.points[:, 1] < 5
+    surface.normals[:, 2] = np.where(surface.points[:, 0] < 10, 1.0, -1.0)  # to either side
+    surface.planar[:] = is_flat
+    ahead = yaw_transform(0.0, (10.0, 0.0, 0.0))
+    above = np.repeat(corners, 30, axis=0) + np.array([-10, 0, 0.06])
+    above[120:, 2] = 0.2
+    bias = ground_bias(above, surface, ahead, np.zeros(3), 0.45, 0.4)
+    weight = 40 * 3 * 0.5 * 0.06
+    width = np.sqrt(2.5)  # the mean of 2^2 and 1^2
+    expected = np.zeros((3, 6))
+    expected[0, [2, 4]] = weight, -10 * weight  # ground ahead that is lifted turns about y
+    expected[1, 4] = -(2**2) / width * weight
+    expected[2, 3] = 1**2 / width * weight
+    np.testing.assert_allclose(bias, expected, atol=1e-12)
+    few = ground_bias(above[:87], surface, ahead, np.zeros(3), 0.45, 0.4)  # 29 of them
+    assert not few.any()
+    assert ground_bias(above[:90], surface, ahead, np.zeros(3), 0.45, 0.4).any()

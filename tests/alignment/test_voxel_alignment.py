@@ -415,11 +415,12 @@ def test_structure_scores_by_hand() -> None:
         (4, 0, 0): 5,  # in free space
         (8, 0, 0): 2,  # on another class
         (12, 0, 0): 2,  # where nothing was observed
+        (0, 0, 1): 2,  # in free space, but beside its class
         (0, 1, 0): 0,  # ground and cars do not count as structure
-        (0, 0, 1): 13,
+        (0, 1, 1): 13,
     }
     query = Query(block_map(query_cells), points_of(query_cells), V)
-    assert structure_scores(query, target, np.eye(4)) == (5, 4, 2, 1)
+    assert structure_scores(query, target, np.eye(4)) == (6, 5, 3, 1)
     bare = Query(block_map({(0, 0, 0): 0}), np.zeros((1, 3)), V)
     assert structure_scores(bare, target, np.eye(4)) == (0, 0, 0, 0)
     assert structure_mask(np.array([0, 1, 9, 2, 5, 8, 13, 255], np.uint8)).tolist() == [
@@ -452,6 +453,7 @@ def test_shares_of_both_sides_by_hand() -> None:
     assert aligned == pytest.approx((0.5**2 * 0.8) ** (1 / 3))
     assert free == pytest.approx((0.4**2 * 0.05) ** (1 / 3))
     assert mutual_shares(bad, good) == (aligned, free)
+    assert MutualScores(good, bad).score == pytest.approx(aligned - free)
     nothing = Scores(0, 0, 0, 0)
     assert mutual_shares(nothing, nothing) == pytest.approx((0.5, 0.2))
 

@@ -69,8 +69,6 @@ def apart(clouds: Clouds) -> list[tuple[int, int]]:
     way = WAY * clouds.voxel
     poses = [clouds.pose(number) for number in range(len(clouds.rows))]
     known = [number for number, pose in enumerate(poses) if pose is not None]
-    if not known:
-        return []
     positions = np.array([pose[:3, 3] for pose in poses if pose is not None])
     chosen = []
     stamps_ns = clouds.stamps_ns()[known]

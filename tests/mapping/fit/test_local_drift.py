@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.findings import SessionFit, StreamFit
-from semloc_logs.mapping.fit.local_drift import apart, drift_of, local_drift
+from semloc_logs.mapping.fit.local_drift import PAIRS, apart, drift_of, local_drift
 from semloc_logs.mapping.keyframes import Collected
-from semloc_logs.numerics.transforms import exp_se3, inverse
+from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
 
 F64 = NDArray[np.float64]
 SPREAD = np.array([0.05, 0.02, 0.01, 0.001, 0.002, 0.004])  # m and rad over 10 m
@@ -148,6 +149,39 @@ def test_drift_that_noise_hides_may_be_as_large_as_the_noise_is_unsure() -> None
         assert drift is not None
         noise = 0.5 * SPREAD[0] / np.sqrt(2)
         assert drift.translation[0] == pytest.approx(np.sqrt(share) * noise / 10.0, rel=0.3)
+
+
+def test_drift_by_hand() -> None:
+    """Eight motions of 10 m that are 5 cm off aside, registered 2 cm more and 2 cm less.
+
+    The variance of the noise is known to (2 / 8)^0.5, a half: that much of it stays.
+    """
+    given = np.array([yaw_transform(0.0, (10.0, 0.0, 0.0))] * 8)
+    there, back = given.copy(), given.copy()
+    there[:, 1, 3] = 0.05 + 0.02
+    back[:, 1, 3] = 0.05 - 0.02
+    drift = drift_of(given, there, back)
+    assert drift is not None
+    aside = np.sqrt(0.05**2 - 0.02**2 + 0.5 * 0.02**2) / 10.0
+    assert drift.translation == pytest.approx((0.0, aside, 0.0))
+    assert drift.rotation == (0.0, 0.0, 0.0)
+
+
+def pairs_of(*positions: float | None) -> list[tuple[int, int]]:
+    """Of keyframes along x, of voxels of 25 cm: pairs are 10 m apart."""
+    poses = [None if x is None else yaw_transform(0.0, (x, 0.0, 0.0)) for x in positions]
+    clouds = SimpleNamespace(rows=np.arange(len(poses)), voxel=0.25, pose=lambda k: poses[k])
+    return apart(cast(Any, clouds))
+
+
+def test_pairs_are_the_first_that_are_far_enoughapart() -> None:
+    assert pairs_of(0.0, 5.0, 10.0, 15.0, 20.0) == [(0, 2), (1, 3), (2, 4)]
+    assert pairs_of(None, 0.0, None, 10.0) == [(1, 3)]
+    assert pairs_of(0.0, 15.0) == [(0, 1)]
+    assert pairs_of(0.0, 15.1) == []  # poses jump
+    assert pairs_of(None, None) == pairs_of() == []
+    many = pairs_of(*np.arange(0.0, 500.0, 5.0))
+    assert (len(many), many[0], many[-1]) == (PAIRS, (0, 2), (97, 99))
 
 
 def test_noisy_registrations_tell_nothing() -> None:
