@@ -7,10 +7,12 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from semloc_logs.alignment import search as search_module
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.mask_grid import REACH
+from semloc_logs.alignment.query_map import SEARCH_VOXELS
 from semloc_logs.alignment.search import (
     MIN_SEARCH_SCORE,
     Candidate,
@@ -18,6 +20,7 @@ from semloc_logs.alignment.search import (
     _rotated,
     _Searched,
     _suppressed,
+    search_hypotheses,
 )
 
 
@@ -75,3 +78,41 @@ def test_no_candidate_stays_where_none_can_become_good(
     target = cast(Any, None)
     found = _chosen([Candidate(3, np.eye(4), score, 1)], {3: target}, cast(Any, None), 5)
     assert len(found) == kept
+
+
+def test_hypotheses_are_searched_twice_and_those_that_meet_become_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Poses along x, in voxels: the second is beside the first already. The first search moves the
+    last one beside the one at 10, in steps of two; poses 3 voxels apart are one after the second.
+    """
+    v = 0.5
+    found = {
+        200: {0.0: (0.4, 0.0), 3.0: (0.45, 3.0), 10.0: (0.5, 10.0), 20.0: (0.6, 11.5)},
+        SEARCH_VOXELS: {0.0: (0.7, 0.0), 3.0: (0.5, 3.0), 11.5: (0.3, 11.5)},
+    }
+    searches = []
+
+    def search(
+        grid: str, evidence: int, start: NDArray[np.float64], yaws: NDArray[np.float64], step: int
+    ) -> tuple[float, NDArray[np.float64]]:
+        searches.append((grid, evidence, start[1] / v, round(np.degrees(yaws.max()), 9), step))
+        score, x = found[evidence][start[1] / v]
+        return score, np.array([0.0, x * v, 0.0, 0.0])
+
+    mutual = SimpleNamespace(score=0.5, is_consistent=True)
+    monkeypatch.setattr(search_module, "mutual_scores", lambda *_: mutual)
+    monkeypatch.setattr(search_module, "search", search)
+    query = SimpleNamespace(voxel_size=v, evidence=SimpleNamespace(first=lambda most: most))
+    targets = {3: SimpleNamespace(mask_grid="grid")}
+    hypotheses = [
+        Hypothesis(3, (0.0, x * v, 0.0, 0.0), votes, 1.0)
+        for votes, x in enumerate([0.0, 1.5, 3.0, 10.0, 20.0])
+    ]
+    best, other = search_hypotheses(hypotheses, cast(Any, targets), cast(Any, query), 18, 5)
+    # 18 headings: 0.8 and 0.3 of half of 20 degrees to either side
+    first = [("grid", 200, x, 8.0, 2) for x in (0.0, 3.0, 10.0, 20.0)]
+    second = [("grid", SEARCH_VOXELS, x, 3.0, 1) for x in (11.5, 3.0, 0.0)]
+    assert searches == first + second
+    assert (best.score, best.votes, best.target_T_query[0, 3]) == (0.7, 0, 0.0)
+    assert (other.score, other.votes, other.target_T_query[0, 3]) == (0.3, 4, 11.5 * v)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from semloc_logs.alignment import refine as refine_module
 from semloc_logs.alignment import search as search_module
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
-from semloc_logs.alignment.icp import Step, Weighting, align
+from semloc_logs.alignment.icp import Fit, Step, Weighting, align
 from semloc_logs.alignment.mask_grid import (
     ANY_BIT,
     FREE_BIT,
@@ -39,6 +42,7 @@ from semloc_logs.voxels.keys import BLOCK, pack
 
 V = 0.5
 U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
 Cell = tuple[int, ...]
 COARSE = cityscapes().coarse
 
@@ -543,6 +547,76 @@ def test_a_coarse_fit_leaves_a_place_that_looks_alike(degrees: int) -> None:
     fine = fine_fit(right.target_T_query, target.surface, query)
     assert np.linalg.norm(fine.target_T_query[:3, 3] - truth[:3, 3]) < 0.1 * V
     assert fine.count == len(query.points)  # the last step takes all of them
+
+
+def fit_at(x: float) -> Fit:
+    T = yaw_transform(0.0, (x, 0.0, 0.0))
+    return Fit(T, 1.0, 100, 0.1, np.eye(6), np.zeros(3), np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize(
+    ("of_target", "of_query", "uncertain"),
+    [(0.2, 0.2, False), (0.3, 0.2, True), (0.2, 0.3, True)],
+)
+def test_a_fine_fit_looks_farther_and_is_held_where_either_side_is_uncertain(
+    of_target: float, of_query: float, uncertain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By more than a quarter of a voxel. Of 12 000 points every second one is taken, at last."""
+    asked: list[object] = []
+
+    def align(points: object, surface: object, start: object, *how: object) -> Fit:
+        asked.extend([how[0], how[2]])
+        return fit_at(0.0)
+
+    monkeypatch.setattr(refine_module, "align", align)
+    monkeypatch.setattr(refine_module, "ground_bias", lambda *_: np.ones((3, 6)))
+    surface = SimpleNamespace(sigma=of_target * V)
+    query = SimpleNamespace(
+        points=np.zeros((12_000, 3)), spread=None, sigma=of_query * V, voxel_size=V
+    )
+    fit = fine_fit(np.eye(4), cast(Any, surface), cast(Any, query))
+    if uncertain:
+        steps = (Step(3.0 * V, 10, 6), Step(2.0 * V, 20, 4), Step(2.0 * V, 1, 2))
+        assert asked == [steps, Weighting(PLANE_NOISE * V, 10.0)]
+        assert not fit.ground_bias.any()
+    else:
+        steps = (Step(0.7 * V, 6, 6), Step(0.4 * V, 10, 4), Step(0.4 * V, 1, 2))
+        assert asked == [steps, Weighting(PLANE_NOISE * V, 0.0)]
+        assert fit.ground_bias.all()
+
+
+@pytest.mark.parametrize(
+    ("voxels", "score", "leaves"),
+    [(1.1, 0.6, True), (0.9, 0.6, False), (1.1, 0.5, False)],
+)
+def test_a_coarse_fit_is_left_for_a_start_a_voxel_away_that_scores_higher(
+    voxels: float, score: float, leaves: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of 0.5. Of 18 headings, 0.6 of half of 20 degrees to either side are tried."""
+    turns = []
+
+    def search(
+        grid: object, evidence: object, pose: F64, yaws: F64, step: int
+    ) -> tuple[float, F64]:
+        turns.append(np.degrees(yaws))
+        return 1.0, pose + np.array([0.0, voxels * V, 0.0, 0.0])
+
+    monkeypatch.setattr(refine_module, "search", search)
+    monkeypatch.setattr(
+        refine_module, "coarse_fit", lambda candidate, *_: fit_at(candidate.target_T_query[0, 3])
+    )
+    monkeypatch.setattr(
+        refine_module,
+        "structure_scores",
+        lambda query, target, T: SimpleNamespace(score=score if T[0, 3] > 2.0 else 0.5),
+    )
+    query = cast(Any, SimpleNamespace(voxel_size=V, evidence=None))
+    fit = fit_at(2.0)
+    candidate = Candidate(0, np.eye(4), 1.0, 10)
+    found = escaped(fit, candidate, cast(Any, SimpleNamespace(mask_grid=None)), query, 18)
+    np.testing.assert_allclose(turns, [[-6.0, -3.0, 0.0, 3.0, 6.0]], atol=1e-12)
+    assert found.target_T_query[0, 3] == pytest.approx(2.0 + voxels * V if leaves else 2.0)
+    assert (found is fit) != leaves
 
 
 def test_an_alignment_of_uncertain_points_is_measured_by_their_radius() -> None:
