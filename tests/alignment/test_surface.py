@@ -117,6 +117,23 @@ def test_flattened_points_lie_on_the_plane_of_a_slow_weighted_fit(seed: int) -> 
         expected.append(p - normal * ((p - mean) @ normal))
     order = np.lexsort(np.round(surface.points, 6).T)
     wanted = np.array(expected)
-    np.testing.assert_allclose(
-        surface.points[order], wanted[np.lexsort(np.round(wanted, 6).T)], atol=1e-6
-    )
+    wanted_order = np.lexsort(np.round(wanted, 6).T)
+    np.testing.assert_allclose(surface.points[order], wanted[wanted_order], atol=1e-6)
+    np.testing.assert_array_equal(surface.spread[order], spread[kept][wanted_order])
+
+
+@pytest.mark.parametrize(
+    ("wide", "high", "is_slab"),
+    [(1.0, 0.49, True), (1.0, 0.51, False), (0.11, 0.0, True), (0.09, 0.0, False)],
+)
+def test_a_slab_is_half_as_thick_as_long_and_no_line(
+    wide: float, high: float, is_slab: bool
+) -> None:
+    """The corners of a box: half its edges are standard deviations, 1 m along x."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    corners *= [1.0, wide, high]
+    assert len(corners) == LEAST_FLAT
+    surface = flattened_surface(corners, np.full((8, 3), 0.1), np.arange(8), 4.0, 0.05)
+    assert surface.planar.tolist() == [is_slab] * 8
+    np.testing.assert_allclose(surface.points[:, 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(surface.normals[:, 2]), 1.0)
