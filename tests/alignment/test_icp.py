@@ -457,6 +457,56 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
         assert np.sqrt(more) == pytest.approx(RANGE_BIAS * 0.1, rel=0.1)
 
 
+def test_rays_turn_with_the_query() -> None:
+    """A wall along x of the target that a query, turned by 90 degrees, sees along its own x.
+
+    It is 0.3 m off, as a ray of 0.3 m across it says. 100 points weigh a tenth with a noise of 0.1
+    m, and two thirds of that in a kernel as wide: 0.3^2 / (0.3^2 + 0.3^2) to one.
+    """
+    wall = np.stack(np.meshgrid(np.linspace(-1, 1, 10), 0.0, np.linspace(0, 2, 10)), -1)
+    surface = surface_of(wall.reshape(-1, 3), CELL)
+    surface.normals[:] = [0.0, -1.0, 0.0]
+    surface.planar[:] = 1.0
+    turned = yaw_transform(np.pi / 2)
+    query = apply(inverse(turned), surface.points + np.array([0.0, 0.3, 0.0]))
+    rays = np.tile([0.3, 0.0, 0.0], (100, 1))
+    found = align(query, surface, turned, (Step(2.0, 0),), rays, Weighting(0.1))
+    weight = 100 * 0.1 * 2 / 3
+    assert found.information[1, 1] == pytest.approx(weight)
+    expected = [0.0, weight * 0.3, 0.0, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(found.range_bias, [expected, [0.0] * 6], atol=1e-9)
+
+
+def test_leaves_pull_by_how_certain_they_are() -> None:
+    """Eight leaves at the corners of a cube, seen 0.3 m to one side by a certain point each and to
+    the other by one of 0.3 m along its ray; noise and kernel are as large.
+
+    Certain ones weigh 1 / (1 + 1), the others a half of 1 / (1 + 1 / 2), a third: the query moves
+    by 0.3 m times (1 / 2 - 1 / 3) / (1 / 2 + 1 / 3).
+    """
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    surface = surface_of(corners, CELL)
+    surface.normals[:] = [1.0, 0.0, 0.0]
+    surface.planar[:] = 0.0
+    aside = np.array([0.3, 0.0, 0.0])
+    rays = np.r_[np.zeros((8, 3)), np.tile([0.0, 0.3, 0.0], (8, 1))]
+    query = np.r_[corners + aside, corners - aside]
+    found = align(query, surface, np.eye(4), (Step(2.0, 1),), rays, Weighting(0.3))
+    np.testing.assert_allclose(found.target_T_query[:3, 3], [-0.06, 0.0, 0.0], atol=1e-5)
+
+
+def test_distances_to_planes_are_those_of_where_a_fit_ends() -> None:
+    """Three walls that meet, without noise, half a centimetre off: near enough for a step of 0.4 m
+    that others follow, but the last one looks again.
+    """
+    side = np.stack(np.meshgrid(np.linspace(0, 4, 40), np.linspace(0, 4, 40)), -1).reshape(-1, 2)
+    walls = np.concatenate([np.insert(side, axis, 0.0, axis=1) for axis in range(3)])
+    query = walls[walls.max(1) < 3][::7] + np.array([0.0, 0.0, 0.005])
+    found = align(query, surface_of(walls, CELL), np.eye(4), (Step(0.4, 10),))
+    assert found.rmse < 1e-4
+    np.testing.assert_allclose(found.target_T_query[:3, 3], [0.0, 0.0, -0.005], atol=1e-4)
+
+
 def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> (
     None
 ):
