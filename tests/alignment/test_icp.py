@@ -183,6 +183,23 @@ def test_nothing_to_align() -> None:
     assert empty.count == 0
 
 
+@pytest.mark.parametrize(("count", "inliers"), [(11, 0.0), (12, 1.0)])
+def test_twelve_points_are_enough(count: int, inliers: float) -> None:
+    floor = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), 0.0), -1).reshape(-1, 3)
+    found = align(floor[:count], surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
+    assert (found.count, found.inliers) == (count, inliers)
+
+
+def test_distances_are_of_the_points_that_meet_a_surface() -> None:
+    """Twenty points a decimetre above a floor, and twenty far away."""
+    floor = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), 0.0), -1).reshape(-1, 3)
+    query = floor[:40] + np.array([0.0, 0.0, 0.1])
+    query[20:, 2] = 10.0
+    found = align(query, surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
+    assert (found.count, found.inliers) == (20, 0.5)
+    assert found.rmse == pytest.approx(0.1)
+
+
 def test_covariance_of_a_room_and_of_a_corridor() -> None:
     rng = np.random.default_rng(4)
     for corridor in (False, True):
