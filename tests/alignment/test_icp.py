@@ -14,7 +14,7 @@ from semloc_logs.alignment.covariance import (
     stiffness,
 )
 from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
-from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
+from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, _increment, align
 from semloc_logs.alignment.level_ground import ground_bias
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import fine_fit
@@ -198,6 +198,15 @@ def test_distances_are_of_the_points_that_meet_a_surface() -> None:
     found = align(query, surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
     assert (found.count, found.inliers) == (20, 0.5)
     assert found.rmse == pytest.approx(0.1)
+    np.testing.assert_array_equal(found.target_T_query, np.eye(4))  # a step of no iterations
+
+
+def test_of_an_increment_that_turns_too_far_the_same_share_moves() -> None:
+    """By 1 m and 0.4 rad, of which 0.2 rad are allowed: half of both."""
+    pull = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, -0.4])
+    T, length, angle = _increment(np.eye(4), np.zeros(3), np.eye(6), pull)
+    assert (length, angle) == pytest.approx((0.5, 0.2), rel=1e-4)
+    np.testing.assert_allclose(T, yaw_transform(0.2, (0.5, 0.0, 0.0)), atol=1e-5)
 
 
 def test_covariance_of_a_room_and_of_a_corridor() -> None:
