@@ -73,6 +73,15 @@ def test_a_plane_is_less_than_0_3_times_as_thick_as_wide() -> None:
         assert surface.planar.tolist() == [is_plane] * NEIGHBOURS
 
 
+def test_a_plane_is_at_least_a_tenth_as_wide_as_long() -> None:
+    """Two rows of seven points, a metre apart: along x a standard deviation of 2 m."""
+    for half, is_plane in ((0.19, 0), (0.21, 1)):
+        points = np.array([[x, y, 0.0] for x in range(-3, 4) for y in (-half, half)])
+        surface = surface_of(points, 2.0)
+        look_at(surface.arrays, np.arange(NEIGHBOURS))
+        assert surface.planar.tolist() == [is_plane] * NEIGHBOURS
+
+
 def test_points_with_few_around_are_no_planes() -> None:
     surface = surface_of(np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), 0.3)
     look_at(surface.arrays, np.arange(3))
