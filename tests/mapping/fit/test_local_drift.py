@@ -170,11 +170,14 @@ def test_drift_by_hand() -> None:
 def pairs_of(*positions: float | None) -> list[tuple[int, int]]:
     """Of keyframes along x, of voxels of 25 cm: pairs are 10 m apart."""
     poses = [None if x is None else yaw_transform(0.0, (x, 0.0, 0.0)) for x in positions]
-    clouds = SimpleNamespace(rows=np.arange(len(poses)), voxel=0.25, pose=lambda k: poses[k])
+    rows = np.arange(len(poses))
+    clouds = SimpleNamespace(
+        rows=rows, voxel=0.25, pose=lambda k: poses[k], stamps_ns=lambda: rows * 10**9
+    )
     return apart(cast(Any, clouds))
 
 
-def test_pairs_are_the_first_that_are_far_enoughapart() -> None:
+def test_pairs_are_the_first_that_are_far_enough_apart() -> None:
     assert pairs_of(0.0, 5.0, 10.0, 15.0, 20.0) == [(0, 2), (1, 3), (2, 4)]
     assert pairs_of(None, 0.0, None, 10.0) == [(1, 3)]
     assert pairs_of(0.0, 15.0) == [(0, 1)]
