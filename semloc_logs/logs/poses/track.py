@@ -11,6 +11,9 @@ from semloc_logs.frames import F64, PoseSample, TransformSample
 from semloc_logs.numerics import transforms
 
 EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: it goes on as it was
+# a motion goes on where it has changed by less than this share, or so little, since the step before
+_CHANGED_SHARE = 0.25
+_CHANGED_SPEED, _CHANGED_TURN = 1.0, 0.2  # m/s, rad/s
 # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
 PERIODS_PER_GAP = 3.0
 # s; nothing that drives is interpolated over more than this, however slow its stream
@@ -178,7 +181,8 @@ class PoseTrack:
     def at(self, stamp_ns: int) -> F64 | None:
         """The pose (4, 4) at ``stamp_ns``; None in a gap and over 0.1 s outside of the stream.
 
-        Outside it the motion goes on as it was: at 10 m/s the nearest pose is off by up to a metre.
+        Outside it a steady motion goes on as it was: at 10 m/s the nearest pose is off by up to a
+        metre. Where the last step is unlike the one before it, as a jump is, the nearest pose stays.
         """
         if not is_time(stamp_ns):
             return None
@@ -197,12 +201,37 @@ class PoseTrack:
         known &= is_within
         for end, is_beyond in ((0, wanted < stamps[0]), (-1, wanted > stamps[-1])):
             rows = np.flatnonzero(known & is_beyond)
+            if not len(rows) or not self._is_steady(end):
+                continue
             mirrored = 2 * stamps[end] - wanted[rows]
             before, is_near = self._within(mirrored)
             rows = rows[is_near]
             # as far beyond the end as the motion was before it
             poses[rows] = poses[rows] @ transforms.inverse(before[is_near]) @ poses[rows]
         return poses, known
+
+    def _is_steady(self, end: int) -> bool:
+        """Whether the step at an end of the stream, the first or last (-1), is like the next to it.
+
+        Steps of poses in quick succession are taken together: noise is large beside one of them.
+        """
+        stamps = self.stamps_ns
+        if len(stamps) <= 2:
+            return False
+        step_ns = max(EDGE_NS, int(stamps[1] - stamps[0] if end == 0 else stamps[-1] - stamps[-2]))
+        towards = step_ns if end == 0 else -step_ns
+        poses, known = self._within(stamps[end] + towards * np.arange(3))
+        if not known.all():
+            return False
+        last, before = transforms.inverse(poses[1:]) @ poses[:-1]
+        seconds = step_ns * 1e-9
+        speed = float(np.linalg.norm(before[:3, 3])) / seconds
+        turn = transforms.rotation_angle(before[:3, :3]) / seconds
+        changed_speed = float(np.linalg.norm(last[:3, 3] - before[:3, 3])) / seconds
+        changed_turn = transforms.rotation_angle(before[:3, :3].T @ last[:3, :3]) / seconds
+        return changed_speed <= max(_CHANGED_SPEED, _CHANGED_SHARE * speed) and (
+            changed_turn <= max(_CHANGED_TURN, _CHANGED_SHARE * turn)
+        )
 
     def _within(self, wanted: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
         """Poses (m, 4, 4) at stamps (m,) between the ends, and which are not in gaps or outside."""

@@ -73,6 +73,36 @@ def test_a_pose_alone_behind_a_gap_is_not_continued() -> None:
     assert pose[0, 3] == pytest.approx(10.0)
 
 
+@pytest.mark.parametrize("period", [0.01, 0.1, 0.4])
+@pytest.mark.parametrize(
+    ("step", "is_steady"),
+    [
+        ((0.0, 0.0), True),
+        ((0.05, 0.0), True),  # its speed grows by 0.5 m/s at most
+        ((3.0, 0.0), False),
+        ((0.0, 0.3), False),
+    ],
+)
+def test_a_jump_at_an_end_is_not_continued(
+    period: float, step: tuple[float, float], is_steady: bool
+) -> None:
+    """At 2 m/s, the first or the last pose farther on by so many metres, turned by so much."""
+    metres, angle = step
+    for is_first in (False, True):
+        poses = PoseTrack()
+        for k in range(51):
+            is_off = k == (0 if is_first else 50)
+            x = 2.0 * period * k + is_off * (-metres if is_first else metres)
+            turned = yaw_transform(is_off * angle, (x, 0.0, 0.0))
+            assert poses.append(EPOCH + round(k * period * S), turned)
+        end = poses.poses[0 if is_first else -1]
+        beyond = at(poses, -0.08 if is_first else 50 * period + 0.08)
+        assert beyond is not None
+        moved = float(np.linalg.norm(beyond[:3, 3] - end[:3, 3]))
+        assert moved == (pytest.approx(0.16, abs=0.06) if is_steady else 0.0)
+        np.testing.assert_allclose(beyond[:3, :3], end[:3, :3], atol=1e-9)
+
+
 def test_one_pose_serves_a_tenth_of_a_second() -> None:
     poses = track(1.0)
     assert at(poses, 1.09) is not None
@@ -179,14 +209,37 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         pose[:3, 3] = (1 - w) * positions[k - 1] + w * positions[k]
         return pose
 
+    def speeds(target: Array, source: Array, seconds: float) -> Array:
+        """Velocity (3,) and rate of turn as a rotation (3, 3) side by side."""
+        step = np.linalg.inv(source) @ target
+        return np.concatenate([step[:3, 3] / seconds, step[:3, :3].ravel()])
+
+    def is_steady(end: int, sign: int) -> bool:
+        """Whether the motion at an end is as it was a step before."""
+        near = end - sign * max(100_000_000, abs(end - int(stamps[-2 if sign > 0 else 1])))
+        first, second, third = between(end), between(near), between(2 * near - end)
+        if len(stamps) <= 2 or first is None or second is None or third is None:
+            return False
+        seconds = abs(end - near) * 1e-9
+        last, before = speeds(first, second, seconds), speeds(second, third, seconds)
+        turn = Rotation.from_matrix(before[3:].reshape(3, 3))
+        more = turn.inv() * Rotation.from_matrix(last[3:].reshape(3, 3))
+        is_as_fast = np.linalg.norm((last - before)[:3]) <= max(
+            1.0, 0.25 * np.linalg.norm(before[:3])
+        )
+        return bool(
+            is_as_fast and more.magnitude() / seconds <= max(0.2, 0.25 * turn.magnitude() / seconds)
+        )
+
     for ms in wanted:
         t = ms * 1_000_000 + EPOCH
         found = poses.at(t)
         inside = int(np.clip(t, stamps[0], stamps[-1]))
         expected = between(inside) if abs(t - inside) <= 100_000_000 else None
         before = between(2 * inside - t)
-        if expected is not None and before is not None:
-            expected = expected @ np.linalg.inv(before) @ expected if t != inside else expected
+        if expected is not None and before is not None and t != inside:
+            if is_steady(inside, int(np.sign(t - inside))):
+                expected = expected @ np.linalg.inv(before) @ expected
         assert (found is None) == (expected is None)
         if found is not None and expected is not None:
             np.testing.assert_allclose(found, expected, atol=1e-7)
