@@ -146,7 +146,8 @@ def _unclaimed(
 ) -> int:
     """How many points lie in bytes that width and height leave out; 0 where these are padding.
 
-    ``points`` (n, 3) are the ones that they claim. Padding is zero, or not a number, or anything.
+    ``points`` (n, 3) are the ones that they claim. Rays without a return are none. Bytes whose
+    ranges are not like the cloud's are padding.
     """
     row, rest = divmod(rows.strides[0], layout.point_step)
     count = len(data) // layout.point_step
@@ -155,18 +156,20 @@ def _unclaimed(
     places = np.arange(count)
     is_claimed = (places // row < layout.height) & (places % row < layout.width)
     others = np.frombuffer(data, rows.dtype, count)[~is_claimed]
-    if len(others) < _FEWEST or not len(points):
+    if not len(points):
         return 0
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
-    some = slice(None, None, max(1, len(others) // _LOOKED_AT))
-    xyz = np.stack([others[columns[axis]][some].astype(np.float64) for axis in "xyz"], 1)
     with np.errstate(over="ignore", invalid="ignore"):
+        xyz = np.stack([others[columns[axis]].astype(np.float64) for axis in "xyz"], 1)
+        xyz = xyz[np.isfinite(xyz).all(1) & xyz.any(1)]
         ranges = np.linalg.norm(xyz, axis=1)
+    if len(xyz) < _FEWEST:
+        return 0
     own = points[:: max(1, len(points) // _LOOKED_AT)].astype(np.float64)
     usual = float(np.median(np.linalg.norm(own, axis=1)))
     is_point = (ranges > usual / _RANGES) & (ranges < usual * _RANGES)
     middle = float(np.median(ranges[is_point])) if is_point.mean() > _SENSE else 0.0
-    return len(others) if usual / _AS_FAR < middle < usual * _AS_FAR else 0
+    return len(xyz) if usual / _AS_FAR < middle < usual * _AS_FAR else 0
 
 
 def _have_returned(xyz: F32, valid: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

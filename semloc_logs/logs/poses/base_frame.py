@@ -342,12 +342,10 @@ class BasePoses:
         if self._edge is None or track is None or track.end_ns is None:
             return []
         used, child = self._edge
-        last_ns = track.end_ns + track.gap_limit_ns()
         others = [
             parent
-            for parent, other_child, is_static in self.tree.edges
-            if other_child == child and parent != used and not is_static
-            if (self.tree.end_ns(parent, child) or 0) > last_ns
+            for parent, other_child, _ in self.tree.edges
+            if other_child == child and parent != used and self._follows(track, parent, child)
         ]
         if not others:
             return []
@@ -358,6 +356,14 @@ class BasePoses:
             f" '{child}'."
         )
         return [Problem("", ProblemKind.TRANSFORM, text, lost=True)]
+
+    def _follows(self, track: PoseTrack, parent: str, child: str) -> bool:
+        """Whether a moving edge begins when ``track`` is over, and goes on beyond a gap of it."""
+        other = self.tree.track(parent, child)
+        if other is None or other.first_ns is None or other.end_ns is None or track.end_ns is None:
+            return False
+        last_ns = track.end_ns
+        return other.first_ns > last_ns and other.end_ns > last_ns + track.gap_limit_ns()
 
     def _child_of(self, edge: Edge | None) -> str | None:
         """The frame that the poses of a TF edge, or without one of the fallback, belong to."""

@@ -66,6 +66,7 @@ class PoseTrack:
         self.invalid = 0
         self.ahead = 0
         self.set_back: dict[int, SetBack] = {}
+        self.first_ns: int | None = None  # the oldest stamp, also where it is forgotten
         self.moves = False  # whether any position differs from the first
         self._keep_ns = None if keep_seconds is None else round(keep_seconds * 1e9)
         self._stamps = np.empty(16, np.int64)
@@ -95,6 +96,8 @@ class PoseTrack:
             self.invalid += 1
             return False
 
+        if self._n == 0:
+            self.first_ns = stamp_ns
         if self._n == len(self._stamps):
             self._make_room()
         self._stamps[self._n] = stamp_ns

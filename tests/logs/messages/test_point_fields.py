@@ -1,6 +1,7 @@
 """Blocks of bytes to points: layouts, byte orders, dropped points and times."""
 
 import struct
+import warnings
 
 import numpy as np
 import pytest
@@ -163,12 +164,15 @@ def test_rows_with_padding_and_points_that_are_none() -> None:
 )
 @pytest.mark.parametrize(
     ("behind", "unclaimed"),
-    [("points", 200), ("zeros", 0), ("nan", 0), ("anything", 0)],
+    [("points", 200), ("some", 180), ("few", 0), ("zeros", 0), ("nan", 0), ("anything", 0)],
 )
 def test_points_that_width_and_height_leave_out_are_counted(
     layout: Layout, behind: str, unclaimed: int
 ) -> None:
-    """400 points are there, 200 are claimed; other bytes in the place of these are padding."""
+    """400 points are there, 200 are claimed; other bytes in the place of these are padding.
+
+    Rays without a return among them, every tenth, are NaN; with 99 measured points nothing is sure.
+    """
     rng = np.random.default_rng(3)
     xyz = rng.uniform(-20.0, 20.0, (400, 3)).astype("<f4")
     place = np.arange(400)
@@ -176,11 +180,24 @@ def test_points_that_width_and_height_leave_out_are_counted(
     is_behind = (place % row >= layout.width) | (place // row >= layout.height)
     if behind == "anything":
         xyz[is_behind] = np.frombuffer(rng.bytes(2400), "<f4").reshape(200, 3)
+    elif behind == "some":
+        xyz[np.flatnonzero(is_behind)[::10]] = np.nan
+    elif behind == "few":
+        xyz[np.flatnonzero(is_behind)[99:]] = np.nan
     elif behind != "points":
         xyz[is_behind] = np.nan if behind == "nan" else 0.0
     p = decode_points(xyz.tobytes(), layout, XYZ, STAMP)
     assert len(p.points) == 200
     assert p.unclaimed == unclaimed
+
+
+def test_padding_of_signalling_nan_gives_no_warning() -> None:
+    xyz = np.random.default_rng(3).uniform(-20.0, 20.0, (400, 3)).astype("<f4")
+    xyz.view("<u4")[200:] = 0x7F800001
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        p = decode_points(xyz.tobytes(), Layout(200, 1, 12, 4800), XYZ, STAMP)
+    assert (len(p.points), p.unclaimed) == (200, 0)
 
 
 def test_tags_of_a_livox() -> None:

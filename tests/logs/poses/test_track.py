@@ -159,6 +159,7 @@ def test_grows_and_forgets() -> None:
     assert pose is not None
     assert pose[0, 3] == pytest.approx(49.985)
     assert poses.at(EPOCH) is None
+    assert poses.first_ns == EPOCH
 
 
 def test_length_and_gaps() -> None:
@@ -210,7 +211,7 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         return pose
 
     def speeds(target: Array, source: Array, seconds: float) -> Array:
-        """Velocity (3,) and rate of turn as a rotation (3, 3) side by side."""
+        """Velocity (3,) and the rotation (9,) of a step."""
         step = np.linalg.inv(source) @ target
         return np.concatenate([step[:3, 3] / seconds, step[:3, :3].ravel()])
 

@@ -109,15 +109,22 @@ def test_points_that_are_not_in_metres_are_named_by_their_unit(
     assert all(p.is_reported for p in named)
 
 
-@pytest.mark.parametrize("other", ["odom_2", "odom"])
-def test_a_frame_that_gets_another_parent_is_named(recorder: Recorder, other: str) -> None:
-    """From 1.5 s on, TF gives the vehicle in another frame, 10 m away."""
+@pytest.mark.parametrize(("other", "first"), [("odom_2", 30), ("odom_2", 0), ("odom", 30)])
+def test_a_frame_that_gets_another_parent_is_named(
+    recorder: Recorder, other: str, first: int
+) -> None:
+    """From 1.5 s on, TF gives the vehicle in another frame only, 10 m away.
+
+    Where that frame is its parent all along, it gets no other one.
+    """
     log = recorder()
     for k in range(60):
         stamp_ns = EPOCH + k * 50 * MS
         is_moved = k >= 30 and other != "odom"
         pose = yaw_transform(0.0, (0.1 * k + 10.0 * is_moved, 0.0, 0.0))
         log.transform("odom" if k < 30 else other, "base_link", pose, stamp_ns, "/tf")
+        if first <= k < 30:
+            log.transform(other, "base_link", pose, stamp_ns, "/tf")
         if k % 10 == 5:
             log.cloud("/points", stamp_ns, "base_link", _sweep(seed=k))
     session, clouds = _fused(log.write())
@@ -125,6 +132,9 @@ def test_a_frame_that_gets_another_parent_is_named(recorder: Recorder, other: st
     if other == "odom":
         assert not texts
         assert len(clouds) == 6
+        return
+    if first == 0:
+        assert not texts
         return
     [text] = texts
     assert text.startswith("TF gives 'base_link' in 'odom' until 2023-11-14T22:13:21.450Z")
