@@ -6,6 +6,7 @@ apart from the time of the database that needed it first, and stays known as lon
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -59,19 +60,29 @@ def not_counted() -> Iterator[None]:
 
 def kept_file(path: Path, make: Callable[[Path], None]) -> Path:
     """``path``; where it is missing, ``make`` writes it under a temporary name. Beside it lies the
-    CPU time that it took.
+    CPU time that it took; 0 s are counted where that cannot be read.
     """
     seconds = path.with_name(f"{path.name}.cpu_s")
     if not path.exists():
         with replacing_file(path) as temporary:
             with measured() as inner:
                 make(temporary)
-            seconds.write_text(f"{inner.cpu_s:.3f}\n", encoding="utf-8")
+            with replacing_file(seconds) as written:
+                written.write_text(f"{inner.cpu_s:.3f}\n", encoding="utf-8")
         _add_apart(inner.cpu_s + inner.apart_s)
         _add_kept(inner.kept_s)
     name = f"{path.parent.name}/{path.name}"
-    _add_kept({name: float(seconds.read_text(encoding="utf-8")) if seconds.exists() else 0.0})
+    _add_kept({name: _read_seconds(seconds)})
     return path
+
+
+def _read_seconds(path: Path) -> float:
+    """The CPU time in a file, s; 0 where it is unknown."""
+    try:
+        cpu_s = float(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return 0.0
+    return cpu_s if math.isfinite(cpu_s) else 0.0
 
 
 def _add_apart(cpu_s: float) -> None:

@@ -70,6 +70,20 @@ def test_a_file_that_could_not_be_made_is_made_the_next_time(tmp_path: Path) -> 
     assert kept_file(tmp_path / "a", worked(0.0)).read_text() == "made"
 
 
+@pytest.mark.parametrize("content", [None, b"", b"0.4 s", b"\xff\xfe", b"nan"])
+def test_a_time_that_cannot_be_read_is_unknown(tmp_path: Path, content: bytes | None) -> None:
+    path = kept_file(tmp_path / "words" / "a", worked(0.0))
+    seconds = path.with_name("a.cpu_s")
+    assert sorted(path.parent.iterdir()) == [path, seconds]
+    if content is None:
+        seconds.unlink()
+    else:
+        seconds.write_bytes(content)
+    with measured() as spent:
+        kept_file(path, worked(100.0))
+    assert spent.kept_s == {"words/a": 0.0}
+
+
 def test_hours_of_a_row_have_what_others_have_kept_once(
     make_store: Callable[..., ViewStore], tmp_path: Path
 ) -> None:

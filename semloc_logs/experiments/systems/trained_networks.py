@@ -42,8 +42,9 @@ def trained(path: Path, network: nn.Module, train: Callable[[], None]) -> None:
         weights = {name: value.contiguous() for name, value in network.state_dict().items()}
         save_file(weights, temporary)
 
+    kept_file(path, make)
     try:
-        network.load_state_dict(load_file(kept_file(path, make)))
+        network.load_state_dict(load_file(path))
     except (SafetensorError, RuntimeError):  # damaged, or of another network
         path.unlink()
         network.load_state_dict(load_file(kept_file(path, make)))
