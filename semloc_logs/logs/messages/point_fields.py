@@ -291,10 +291,10 @@ def _in_true_order(rows: NDArray[np.void]) -> NDArray[np.void]:
     """The same bytes in the order of bytes that makes sense.
 
     Writers fill in the flag for the order of bytes wrongly: floats read in the other order than
-    they were written are tiny, huge or no numbers.
+    they were written are tiny, huge or no numbers. A few points do not tell.
     """
     swapped = rows.view(rows.dtype.newbyteorder())
-    if _sense(rows) < _NONSENSE and _sense(swapped) > _SENSE:
+    if rows.size >= _FEWEST and _sense(rows) < _NONSENSE and _sense(swapped) > _SENSE:
         return swapped
     return rows
 

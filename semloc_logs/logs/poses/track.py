@@ -185,7 +185,7 @@ class PoseTrack:
         """The pose (4, 4) at ``stamp_ns``; None in a gap and over 0.1 s outside of the stream.
 
         Outside it a steady motion goes on as it was: at 10 m/s the nearest pose is off by up to a
-        metre. Where the last step is unlike the one before it, as a jump is, the nearest pose stays.
+        metre. Where the last step is unlike the one before it, as a jump is, that pose stays.
         """
         if not is_time(stamp_ns):
             return None

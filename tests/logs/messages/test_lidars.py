@@ -18,13 +18,15 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.cli.main import program
 from semloc_logs.errors import RoleError
-from semloc_logs.frames import LidarFrame
+from semloc_logs.frames import LidarFrame, PointTimeRemark
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problems, lost, sentences
 from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import find_roles, guess_roles
 from semloc_logs.logs.session.session import SessionOptions, open_session
+from semloc_logs.logs.session.tally import Tally
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 
@@ -210,6 +212,7 @@ def livox_message(
     frame_id: str = "livox",
     count: int = 5,
     tags: tuple[int, ...] = (16,) * 5,
+    step: int = 20_000_000,
 ) -> tuple[bytes, Definition]:
     store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(CUSTOM["point"], f"{package}/msg/CustomPoint"))
@@ -221,7 +224,13 @@ def livox_message(
     )
     points = [
         t[f"{package}/msg/CustomPoint"](
-            offset_time=k * 20_000_000, x=1.0 + k, y=2.0, z=-k, reflectivity=7, tag=tags[k], line=k
+            offset_time=k * step,
+            x=1.0 + k,
+            y=2.0,
+            z=-k,
+            reflectivity=7,
+            tag=tags[k % len(tags)],
+            line=k % 6,
         )
         for k in range(count)
     ]
@@ -277,6 +286,32 @@ def test_points_that_a_livox_tags_as_noise(tag: int, noise: int) -> None:
     assert isinstance(frame, LidarFrame)
     assert frame.points[:, 0].tolist() == [1, 3, 4, 5] if noise else [1, 2, 3, 4, 5]
     assert (frame.lost, sentences(problems)) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("step", "is_other", "last_ns"),
+    [(500_000, False, 99_500_000), (50, True, 9_950_000), (1, True, 199_000_000)],
+)
+def test_livox_times_that_are_no_nanoseconds_are_named(
+    step: int, is_other: bool, last_ns: int
+) -> None:
+    """200 points: 99.5 ms in nanoseconds, 9.95 ms in microseconds, 199 ms in milliseconds."""
+    data, definition = livox_message(PACKAGES[1], "cdr", count=200, step=step)
+    type_ = f"{PACKAGES[1]}/msg/CustomMsg"
+    [frame] = Decoder(Problems()).frames(Message("/l", type_, "cdr", 1, data, definition))
+    assert isinstance(frame, LidarFrame)
+    assert frame.offset_ns is not None
+    assert frame.offset_ns[[0, -1]].tolist() == [1000, 1000 + last_ns]
+    assert frame.remark == (PointTimeRemark.OTHER_UNIT if is_other else None)
+    tally = Tally()
+    tally.saw("/l")
+    tally.measured(frame)
+    texts = sentences(tally.problems(PoseTrack(), "base_link"))
+    assert texts == is_other * [
+        "/l: 1 of 1 sweeps have point times in microseconds or milliseconds, it seems: in "
+        "nanoseconds, as their message defines them, more points would be measured than any "
+        "sensor can."
+    ]
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])

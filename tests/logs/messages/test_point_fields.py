@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
-from semloc_logs.logs.messages.point_times import offsets_ns
+from semloc_logs.logs.messages.point_times import offsets_ns, sweep_unit
 
 STAMP = 1_700_000_000_123_456_789
 XYZ = [Field("x", 0, "f4"), Field("y", 4, "f4"), Field("z", 8, "f4")]
@@ -275,6 +275,24 @@ def test_units_and_origins_of_times(values: NDArray[np.generic], expected: list[
     assert found is not None
     assert found.dtype == np.int64
     np.testing.assert_allclose(found, expected, atol=20)
+
+
+@pytest.mark.parametrize(
+    ("count", "last", "unit"),
+    [
+        (20_000, 100_000_000, 1),  # in 0.1 s
+        (20_000, 100_000, 1_000),  # 2e8 points a second, if these were nanoseconds
+        (20_000, 100, 1_000_000),  # 2e11
+        (100, 100, 1_000_000),  # no fewer tell
+        (99, 100, 1),
+        (20_000, 0, 1),  # a flash sensor
+        (20_000, 1_000, 1),  # 1 ms or 1 s: no sweep
+        (500, 60_000, 1),  # 8.3e6 points a second, which are possible
+        (700, 60_000, 1_000),  # 1.2e7, which are not
+    ],
+)
+def test_the_unit_of_times_that_should_be_nanoseconds(count: int, last: int, unit: int) -> None:
+    assert sweep_unit(np.linspace(0, last, count).astype(np.int64)) == unit
 
 
 def test_differences_to_the_stamp_may_have_lost_their_sign() -> None:

@@ -238,9 +238,9 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         inside = int(np.clip(t, stamps[0], stamps[-1]))
         expected = between(inside) if abs(t - inside) <= 100_000_000 else None
         before = between(2 * inside - t)
-        if expected is not None and before is not None and t != inside:
-            if is_steady(inside, int(np.sign(t - inside))):
-                expected = expected @ np.linalg.inv(before) @ expected
+        goes_on = t != inside and is_steady(inside, int(np.sign(t - inside)))
+        if goes_on and expected is not None and before is not None:
+            expected = expected @ np.linalg.inv(before) @ expected
         assert (found is None) == (expected is None)
         if found is not None and expected is not None:
             np.testing.assert_allclose(found, expected, atol=1e-7)
