@@ -225,12 +225,10 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         last, before = speeds(first, second, seconds), speeds(second, third, seconds)
         turn = Rotation.from_matrix(before[3:].reshape(3, 3))
         more = turn.inv() * Rotation.from_matrix(last[3:].reshape(3, 3))
-        is_as_fast = np.linalg.norm((last - before)[:3]) <= max(
-            1.0, 0.25 * np.linalg.norm(before[:3])
-        )
-        return bool(
-            is_as_fast and more.magnitude() / seconds <= max(0.2, 0.25 * turn.magnitude() / seconds)
-        )
+        change = float(np.linalg.norm((last - before)[:3]))
+        is_as_fast = change <= max(1.0, 0.25 * float(np.linalg.norm(before[:3])))
+        rate = float(turn.magnitude()) / seconds
+        return is_as_fast and float(more.magnitude()) / seconds <= max(0.2, 0.25 * rate)
 
     for ms in wanted:
         t = ms * 1_000_000 + EPOCH
