@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
 from collections.abc import Mapping
-from itertools import combinations
+
+import numpy as np
 
 from semloc_logs.mapping.session_map import SessionMap
 
@@ -19,16 +19,33 @@ def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
     Whether by the same file under two names, by a copy in another container, or by a part that both
     have: their keyframes have equal stamps, and points with the same mean.
     """
-    owners: dict[tuple[int, tuple[float, ...]], list[str]] = defaultdict(list)
-    for name, session in sorted(maps.items()):
-        means = session.view_means()
-        for key in zip(session.stamps_ns[: len(means)].tolist(), means, strict=True):
-            owners[key].append(name)
-    shared = Counter(pair for names in owners.values() for pair in combinations(names, 2))
-    return [
-        f"Sessions {first} and {second} are of one recording: {count} of their keyframes are the"
-        " same measurements, and closures between these show nothing; give each recording once."
-        for (first, second), count in sorted(shared.items())
-        if first != second
-        and count >= min(LEAST_SHARED, len(maps[first].stamps_ns), len(maps[second].stamps_ns))
-    ]
+    spans = sorted(
+        (int(session.stamps_ns.min()), int(session.stamps_ns.max()), name)
+        for name, session in maps.items()
+        if len(session.stamps_ns)
+    )
+    texts = []
+    for number, (_, end_ns, first) in enumerate(spans):
+        for start_ns, _, second in spans[number + 1 :]:
+            if start_ns > end_ns:
+                break
+            least = min(LEAST_SHARED, *(len(maps[name].stamps_ns) for name in (first, second)))
+            count = _shared(maps[first], maps[second])
+            if count >= least:
+                names = " and ".join(sorted((first, second)))
+                texts.append(
+                    f"Sessions {names} are of one recording: {count} of their keyframes are the"
+                    " same measurements, and closures between these show nothing; give each"
+                    " recording once."
+                )
+    return sorted(texts)
+
+
+def _shared(session: SessionMap, other: SessionMap) -> int:
+    """How many keyframes of both have one stamp, and points with the same mean."""
+    _, mine, its = np.intersect1d(session.stamps_ns, other.stamps_ns, return_indices=True)
+    means = session.view_means()
+    other_means = other.view_means()
+    if not means or not other_means:
+        return 0
+    return sum(means[i] == other_means[k] for i, k in zip(mine, its, strict=True))
