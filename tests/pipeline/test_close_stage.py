@@ -28,6 +28,7 @@ from semloc_logs.stages import run as run_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 Close = Callable[..., Report]
@@ -202,6 +203,16 @@ def test_a_new_session_is_searched_and_nothing_else(
         add(other_way, name)
     assert tools.files(coarse.path) == tools.files(all_at_once.path)
     assert tools.files(other_way.path) == tools.files(all_at_once.path)
+
+
+def test_a_log_under_two_names_is_told(close: Close, coarse: Workspace) -> None:
+    """Its closures are kept, but of a drive with itself they show nothing."""
+    assert not [text for text in close().skipped if "one recording" in str(text)]
+    again = coarse.session("again")
+    shutil.copytree(coarse.session("monday").path, again.path)
+    write_json(again.session_json, read_json(again.session_json) | {"name": "again"})
+    [text] = [str(text) for text in close().skipped if "one recording" in str(text)]
+    assert text.startswith("Sessions again and monday are of one recording")
 
 
 def test_a_selection_restricts_what_is_searched_and_never_what_is_known(
