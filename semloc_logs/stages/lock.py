@@ -112,10 +112,11 @@ def _remove_lock(work: Workspace, path: Path) -> None:
 
 
 def _clear(work: Workspace, paths: Iterable[Path]) -> None:
-    """Remove locks, as who has the gate may. WorkspaceError where somebody has one of them."""
+    """WorkspaceError where somebody has one of the locks; locks of pairs are removed."""
     for path in paths:
         with _locked(work, _name(work, path), 0.0):  # nobody has it
-            path.unlink(missing_ok=True)
+            if path.parent != work.locks:
+                path.unlink(missing_ok=True)
 
 
 def _name(work: Workspace, path: Path) -> str:

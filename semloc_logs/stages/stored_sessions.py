@@ -92,6 +92,7 @@ def rename_session(work: Workspace, name: str, new_name: str) -> None:
         sync_folder(new.parent)
     shutil.rmtree(work.path / "alignments" / f"query={name}", ignore_errors=True)
     _clear_targets(work, name)
+    work.session_lock(name).unlink(missing_ok=True)
     _decide(work)
 
 
@@ -104,6 +105,7 @@ def remove_session(work: Workspace, name: str) -> None:
     folder.session_json.unlink()  # without it the rest is nothing
     shutil.rmtree(folder.path)
     sync_folder(folder.path.parent)
+    work.session_lock(name).unlink(missing_ok=True)
     _decide(work)
 
 
