@@ -56,8 +56,8 @@ def command(
     Recall is the share of the queries near a database keyframe (5 m) that have a correct closure.
     After semloc optimize also the errors of the trajectories before and after: ATE and RPE of 10 m,
     root mean squares, as evo defines them; and how sharp the common map is, which needs no truth.
-    With --heading 90 a query counts where all keyframes
-    near it were driven across, and closures between such views.
+    With --heading 90 a query counts where all keyframes near it were driven across, and closures
+    between such views.
 
     \b
     Example:  semloc evaluate -w work --truth truth.json

@@ -699,7 +699,7 @@ def test_without_level_ground_none_is_off() -> None:
 
 
 def test_ground_bias_by_hand() -> None:
-    """Level ground at four corners of 4 m by 2 m, 10 m ahead, and beside it what is no plane.
+    """Level ground at four corners of 4 m by 2 m, 10 m ahead, and rough points beside it.
 
     A query lies 6 cm above it, as much as the kernel of a radius of 40 cm is wide: a weight of a
     half. Ten points at each corner are looked at, which stand for thirty.
