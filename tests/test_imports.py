@@ -107,6 +107,7 @@ INNER_ORDER = {
         "alignment_tables",
         "tracks",
         "session_pairs",
+        "recent",
         "database",
         "visibility",
         "target_surface",

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.closures.recent import Recent
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.store import Keyframe, read_keyframe
@@ -24,13 +24,12 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-Cached = TypeVar("Cached")
-# in memory at once
-CACHED_TARGETS = 16
-CACHED_SURFACES = 24
-CACHED_SQUARES = 48
-CACHED_KEYFRAMES = 32
-OPEN_DATABASES = 256  # 3 MB each for a kilometre
+# bytes in memory at once
+TARGETS = 256 << 20  # 36 MB a submap of sparse sweeps
+SURFACES = 128 << 20
+SQUARES = 32 << 20
+KEYFRAMES = 32 << 20
+OPEN_DATABASES = 64  # 3 MB each for a kilometre
 # voxels: words of a submap are hidden by squares, keyframes by stretches of road of this length
 SQUARE_VOXELS = 16
 
@@ -51,23 +50,6 @@ class TargetSurface:
     keyframes: I64
 
 
-class Recent(Generic[Cached]):
-    """The most recently used values, at most ``size``."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._values: OrderedDict[Hashable, Cached] = OrderedDict()
-
-    def get(self, key: Hashable, make: Callable[[], Cached]) -> Cached:
-        """The value of ``key``, made if it is not there."""
-        if key not in self._values:
-            self._values[key] = make()
-            if len(self._values) > self._size:
-                self._values.popitem(last=False)
-        self._values.move_to_end(key)
-        return self._values[key]
-
-
 class Caches:
     """What was read and made last, of one database or of all that a process has open.
 
@@ -75,10 +57,10 @@ class Caches:
     """
 
     def __init__(self) -> None:
-        self.targets: Recent[Target] = Recent(CACHED_TARGETS)
-        self.surfaces: Recent[TargetSurface] = Recent(CACHED_SURFACES)
-        self.squares: Recent[tuple[I64, F64]] = Recent(CACHED_SQUARES)
-        self.keyframes: Recent[Keyframe] = Recent(CACHED_KEYFRAMES)
+        self.targets: Recent[Target] = Recent(TARGETS)
+        self.surfaces: Recent[TargetSurface] = Recent(SURFACES)
+        self.squares: Recent[tuple[I64, F64]] = Recent(SQUARES)
+        self.keyframes: Recent[Keyframe] = Recent(KEYFRAMES)
 
 
 class Database:
@@ -162,9 +144,10 @@ _OPEN = Caches()  # of the databases of this process
 
 
 @lru_cache(maxsize=OPEN_DATABASES)
-def open_database(work: Path, target: str, fingerprint: str, settings: Resolved) -> Database:
+def open_database(work: Path, target: str, words: str, settings: Resolved) -> Database:
     """The database of one session, kept between the tasks of a process.
 
-    ``fingerprint`` is of all that it depends on.
+    ``words`` is the fingerprint of its words and its map.
     """
-    return Database(Workspace(work), (target,), settings, _OPEN, (target, fingerprint))
+    of_settings = settings.fingerprint("descriptor", "fusion", "query", "closures")
+    return Database(Workspace(work), (target,), settings, _OPEN, (work, target, words, of_settings))

@@ -45,13 +45,15 @@ Surveyed = Mapping[int, Mapping[str, Votes]]  # of queries, by keyframe and sess
 class SearchTask:
     """Some queries of one session to search in others; picklable.
 
-    ``targets`` are fingerprints of the pairs by session. The alignments go to ``output``.
+    ``targets`` are fingerprints of the pairs by session, ``words`` those of the sessions' words and
+    maps. The alignments go to ``output``.
     """
 
     work: Path
     session: str
     keyframes: tuple[int, ...]
     targets: dict[str, str]
+    words: Mapping[str, str]
     settings: Resolved
     output: Path
 
@@ -66,10 +68,10 @@ def search_queries(task: SearchTask) -> int:
     least_votes = min_votes(session, task.settings)
     votes = survey_queries(task, session, queries) if least_votes > 0 else {k: {} for k in queries}
     found: list[Alignment] = []
-    for target, fingerprint in task.targets.items():
+    for target in task.targets:
 
-        def search(keyframe: int, target: str = target, key: str = fingerprint) -> list[Alignment]:
-            database = open_database(task.work, target, key, task.settings)
+        def search(keyframe: int, target: str = target) -> list[Alignment]:
+            database = open_database(task.work, target, task.words[target], task.settings)
             return search_query(database, session, keyframe, queries[keyframe])
 
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
@@ -151,7 +153,7 @@ def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, 
         described, turned = prepare(query, variant, ground_below(session, keyframe), settings)
         return turned, described.centre.astype(float) * settings.fusion.voxel_size
 
-    others = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
+    others = tuple((name, task.words[name]) for name in task.targets if name != task.session)
     if others:
         surveys = _surveys(task.work, others, session.has_classes, settings)
         for variant, survey in surveys.items():
@@ -159,8 +161,8 @@ def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, 
                 votes[keyframe] |= survey.votes(*words(keyframe, variant))
 
     if task.session in task.targets:
-        fingerprint = task.targets[task.session]
-        database = open_database(task.work, task.session, fingerprint, settings)
+        words_of_session = task.words[task.session]
+        database = open_database(task.work, task.session, words_of_session, settings)
         for keyframe in with_structure:
             visible = visible_to(database, session, keyframe)
             for variant, allowed in allowed_words(visible, session).items():
@@ -184,8 +186,8 @@ def _surveys(
 ) -> dict[str, Survey]:
     """Surveys of the targets of a session, by the words that they are searched by.
 
-    They are kept between the tasks of a process; ``targets`` come with fingerprints of all that
-    they depend on. ``has_classes``: whether the session's labels come from a log or a model.
+    They are kept between the tasks of a process; ``targets`` come with fingerprints of their words.
+    ``has_classes``: whether the session's labels come from a log or a model.
     """
     forced = settings.descriptor.variant
     names: dict[str, list[str]] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import chain, islice
 from pathlib import Path
@@ -111,8 +111,16 @@ def _describe(
 
 def words_fingerprint(session: SessionMap, settings: Resolved) -> str:
     """Of all that the words of a session depend on, apart from their variants."""
-    fused = session.json["fingerprint"]
-    return fingerprint_of((fused, settings.fingerprint("descriptor"), _weights(settings)))
+    return words_fingerprints({"": session}, settings)[""]
+
+
+def words_fingerprints(sessions: Mapping[str, SessionMap], settings: Resolved) -> dict[str, str]:
+    """Of all that the words of each session depend on, apart from their variants."""
+    of_all = (settings.fingerprint("descriptor"), _weights(settings))
+    return {
+        name: fingerprint_of((session.json["fingerprint"], *of_all))
+        for name, session in sessions.items()
+    }
 
 
 def is_described(session: SessionMap, variants: Iterable[str], settings: Resolved) -> bool:

@@ -27,7 +27,7 @@ from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
-from semloc_logs.stages.describe import check_settings, is_described, words_fingerprint
+from semloc_logs.stages.describe import check_settings, is_described, words_fingerprints
 from semloc_logs.stages.inputs import fingerprint_of
 from semloc_logs.stages.state import OF_DECISION
 from semloc_logs.subvolumes.submap_descriptors import variants_for
@@ -140,7 +140,8 @@ class PairSearch:
         if not self.alone:
             self._remove_old_parts()
         sessions = self._missing()
-        tasks = [task for one in sessions for task in self._tasks(one)]
+        words = words_fingerprints(self.maps, self.settings)
+        tasks = [task for one in sessions for task in self._tasks(one, words)]
         results = zip(tasks, engine.map(search_queries, tasks), strict=True)
         searches = sum(len(task.keyframes) for task in tasks)
         searched = 0
@@ -196,16 +197,18 @@ class PairSearch:
             if folder.name not in open_searches:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def _tasks(self, one: Missing) -> list[SearchTask]:
+    def _tasks(self, one: Missing, words: Mapping[str, str]) -> list[SearchTask]:
         path = self.work.path.absolute()
+        of_targets = {name: words[name] for name in one.fingerprints}
         tasks = []
         for chunk in one.chunks:
             targets = one.targets(chunk)
             if targets:
                 name = f"{chunk[0]:06d}-{fingerprint_of(targets.values())}.parquet"
                 output = one.folder.absolute() / name
-                task = SearchTask(path, one.session, chunk, targets, self.settings, output)
-                tasks.append(task)
+                tasks.append(
+                    SearchTask(path, one.session, chunk, targets, of_targets, self.settings, output)
+                )
         return tasks
 
     def _metadata(self, one: Missing) -> dict[str, dict[str, Any]]:
@@ -242,7 +245,7 @@ def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any
 
 def pair_fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:
     """All pairs, with what their alignments depend on."""
-    words = {name: words_fingerprint(m, settings) for name, m in maps.items()}
+    words = words_fingerprints(maps, settings)
     used = settings.tables("query", "closures")
     for key in OF_DECISION:
         section, name = key.split(".")

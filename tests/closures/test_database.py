@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.query_map import view_centres
 from semloc_logs.closures import target_surface as target_surface_module
-from semloc_logs.closures.database import Database, Recent
+from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import QueryContext, allowed_words, close_query
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import everything, visible_to
@@ -295,22 +295,6 @@ def test_a_drive_without_revisits_does_not_answer_itself(tmp_path: Path) -> None
     )
     view = visible_to(Database(Workspace(tmp_path), ("a",), Settings().resolved()), session, 10)
     assert allowed_words(view, session) == {}
-
-
-def test_recent_values_are_made_once_and_the_oldest_is_forgotten() -> None:
-    recent: Recent[int] = Recent(2)
-    made: list[str] = []
-
-    def value(key: str) -> int:
-        def make() -> int:
-            made.append(key)
-            return len(made)
-
-        return recent.get(key, make)
-
-    assert [value(k) for k in "aabab"] == [1, 1, 2, 1, 2]
-    assert (value("c"), value("b"), value("a")) == (3, 2, 4)
-    assert made == ["a", "b", "c", "a"]
 
 
 def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
