@@ -45,7 +45,7 @@ Surveyed = Mapping[int, Mapping[str, Votes]]  # of queries, by keyframe and sess
 class SearchTask:
     """Some queries of one session to search in others; picklable.
 
-    ``targets`` are fingerprints of the pairs by session, ``words`` those of the sessions' words and
+    ``targets`` are fingerprints of the pairs by session, ``words`` of the sessions' own words and
     maps. The alignments go to ``output``.
     """
 
