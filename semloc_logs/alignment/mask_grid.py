@@ -14,17 +14,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+from semloc_logs.numerics.bits import EACH_BYTE, bytes_set
+from semloc_logs.voxels.grid import EIGHTS, FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
 
 FREE_BIT = 128  # observed free and nothing occupied beside it
 ANY_BIT = 64  # occupied, unlabelled included
 CLASS_BITS = 6  # of a mask
-# cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
+HIGHEST = np.uint64(FREE_BIT * EACH_BYTE)  # bit of each byte of a word
+# cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it,
+# and blocks begin at whole eights
 REACH = 4
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 Arrays = tuple[U8, F64, float]  # of a grid, in the order of its fields
 
 
@@ -67,36 +71,53 @@ def wanted_bits(state: U8, coarse: U8) -> U8:
     return np.where(known, known, bits)
 
 
-def build_mask_grid(blocks: BlockMap, voxel_size: float, coarse: U8) -> MaskGrid:
-    """The masks of a map, with a margin that a search cannot leave."""
+def build_mask_grid(
+    blocks: BlockMap, occupied: tuple[NDArray[np.int32], U8], voxel_size: float, coarse: U8
+) -> MaskGrid:
+    """The masks of a map with its ``occupied`` voxels, and a margin that a search cannot leave."""
     low, high = blocks.bounds()
     margin = 2 * REACH
     mask = np.zeros(tuple((high - low + 2 * margin).tolist()), np.uint8)
+    ijk, label = occupied
+    _mark_occupied(mask, ijk - low + margin, class_bits(label, coarse))
     corners = unpack(blocks.keys).astype(np.int64) * BLOCK - low + margin
-    _fill(mask, corners, blocks.state, class_bits(np.arange(256, dtype=np.uint8), coarse))
+    _mark_free(mask, corners, np.ascontiguousarray(blocks.state))
     return MaskGrid(mask, (low - margin).astype(float) * voxel_size, voxel_size)
 
 
 @njit(cache=True, nogil=True)
-def _fill(mask: U8, corners: NDArray[np.int64], state: U8, bits: U8) -> None:
-    """Set the bits of occupied voxels in their cells and the 26 beside; then the free cells'.
+def _mark_occupied(mask: U8, cells: I64, bits: U8) -> None:
+    """Set the ``bits`` (m,) of occupied ``cells`` (m, 3) in them and in the 26 beside."""
+    flat = mask.ravel()
+    _, ny, nz = mask.shape
+    for m in range(len(cells)):
+        x, y, z = cells[m]
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                middle = ((x + dx) * ny + y + dy) * nz + z
+                # unsigned: numba would make sure of every index that it is not counted from the end
+                flat[np.uint64(middle - 1)] |= bits[m]
+                flat[np.uint64(middle)] |= bits[m]
+                flat[np.uint64(middle + 1)] |= bits[m]
 
-    Blocks (n,) have their corner cells at ``corners`` (n, 3).
+
+@njit(cache=True, nogil=True)
+def _mark_free(mask: U8, corners: I64, state: U8) -> None:
+    """Set the free bit of free cells that have none yet, eight along z at a time.
+
+    Blocks (n,) have their corner cells at ``corners`` (n, 3); these lie at whole eights.
     """
-    for want_free in (False, True):
-        for n in range(len(corners)):
-            for m in range(state.shape[1]):
-                value = state[n, m]
-                x = corners[n, 0] + m // BLOCK**2
-                y = corners[n, 1] + m // BLOCK % BLOCK
-                z = corners[n, 2] + m % BLOCK
-                if not want_free and bits[value]:
-                    for dx in range(-1, 2):
-                        for dy in range(-1, 2):
-                            for dz in range(-1, 2):
-                                mask[x + dx, y + dy, z + dz] |= bits[value]
-                elif want_free and value == FREE_STATE and mask[x, y, z] == 0:
-                    mask[x, y, z] = FREE_BIT
+    masks = mask.ravel().view(np.uint64)
+    states = state.view(np.uint64)
+    _, ny, nz = mask.shape
+    for n in range(len(corners)):
+        x, y, z = corners[n]
+        for e in range(EIGHTS):
+            is_free = ~bytes_set(states[n, e] ^ np.uint64(FREE_STATE * EACH_BYTE)) & HIGHEST
+            if is_free:
+                line = (x + e // (2 * BLOCK)) * ny + y + e // 2 % BLOCK
+                eight = np.uint64((line * nz + z) // 8 + e % 2)
+                masks[eight] |= is_free & ~bytes_set(masks[eight])
 
 
 @njit(cache=True, nogil=True)

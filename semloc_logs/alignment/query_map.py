@@ -136,4 +136,4 @@ class Query:
     @cached_property
     def mask_grid(self) -> MaskGrid:
         """Bit masks to look a target's voxels up in."""
-        return build_mask_grid(self.blocks, self.voxel_size, cityscapes().coarse)
+        return build_mask_grid(self.blocks, self.occupied, self.voxel_size, cityscapes().coarse)

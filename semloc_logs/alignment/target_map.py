@@ -35,19 +35,24 @@ class Target:
     voxel_size: float
 
     @cached_property
+    def occupied(self) -> tuple[NDArray[np.int32], U8]:
+        """Coordinates (n, 3) and class (n,) of the occupied voxels."""
+        return self.blocks.occupied()
+
+    @cached_property
     def mask_grid(self) -> MaskGrid:
         """Bit masks to look voxels up in."""
-        return build_mask_grid(self.blocks, self.voxel_size, cityscapes().coarse)
+        return build_mask_grid(self.blocks, self.occupied, self.voxel_size, cityscapes().coarse)
 
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        return structure_of(self.blocks.occupied(), self.voxel_size)
+        return structure_of(self.occupied, self.voxel_size)
 
     @cached_property
     def surface(self) -> Surface:
         """The centres of the occupied voxels, to align with to a fraction of a voxel."""
-        ijk, _ = self.blocks.occupied()
+        ijk, _ = self.occupied
         return surface_of((ijk + 0.5) * self.voxel_size, COARSE_RADII[0] * self.voxel_size)
 
 

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
+from semloc_logs.numerics.bits import EACH_BYTE, bytes_set, popcount
 from semloc_logs.numerics.hash_table import EMPTY
 from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.carve import (
@@ -27,6 +28,7 @@ from semloc_logs.voxels.carve import (
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 FREE_STATE, UNOBSERVED_STATE = 254, 253
+EIGHTS = BLOCK**3 // 8  # words of eight states in a block
 SCALE = 20  # int8 log-odds are in units of 1/20
 FIRST_PLACES = 1 << 15  # of the table of votes, which grows
 
@@ -52,7 +54,8 @@ class BlockMap:
 
     def occupied(self) -> tuple[NDArray[np.int32], U8]:
         """Voxel coordinates (m, 3) and class of the occupied voxels, in block order."""
-        return _occupied(unpack(self.keys).astype(np.int32) * np.int32(BLOCK), self.state)
+        corner = unpack(self.keys).astype(np.int32) * np.int32(BLOCK)
+        return _occupied(corner, np.ascontiguousarray(self.state))
 
     def bounds(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Lowest voxel and one past the highest voxel of the blocks; zeros without blocks."""
@@ -86,22 +89,34 @@ class BlockMap:
 @njit(cache=True, nogil=True)
 def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], U8]:
     """Coordinates (m, 3) and classes of occupied voxels; blocks lie at ``corner`` (n, 3)."""
+    eights = state.view(np.uint64)
     count = 0
-    for value in state.ravel():
-        count += value != FREE_STATE and value != UNOBSERVED_STATE
+    for n in range(len(eights)):
+        for e in range(EIGHTS):
+            count += popcount(_are_occupied(eights[n, e]))
     ijk = np.empty((count, 3), np.int32)
     label = np.empty(count, np.uint8)
     row = 0
-    for n in range(len(state)):
-        for m in range(state.shape[1]):
-            value = state[n, m]
-            if value != FREE_STATE and value != UNOBSERVED_STATE:
-                ijk[row, 0] = corner[n, 0] + m // 256
-                ijk[row, 1] = corner[n, 1] + m // 16 % 16
-                ijk[row, 2] = corner[n, 2] + m % 16
-                label[row] = value
-                row += 1
+    for n in range(len(eights)):
+        for e in range(EIGHTS):
+            if not _are_occupied(eights[n, e]):  # as in nearly all
+                continue
+            for m in range(8 * e, 8 * e + 8):
+                value = state[n, m]
+                if value != FREE_STATE and value != UNOBSERVED_STATE:
+                    ijk[row, 0] = corner[n, 0] + m // BLOCK**2
+                    ijk[row, 1] = corner[n, 1] + m // BLOCK % BLOCK
+                    ijk[row, 2] = corner[n, 2] + m % BLOCK
+                    label[row] = value
+                    row += 1
     return ijk, label
+
+
+@njit(cache=True, nogil=True)
+def _are_occupied(eight: np.uint64) -> np.uint64:
+    """A bit for each of eight states, the bytes of a word, that is neither free nor unobserved."""
+    not_free = bytes_set(eight ^ np.uint64(FREE_STATE * EACH_BYTE))
+    return not_free & bytes_set(eight ^ np.uint64(UNOBSERVED_STATE * EACH_BYTE))
 
 
 @njit(cache=True, nogil=True)

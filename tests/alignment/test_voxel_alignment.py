@@ -17,6 +17,7 @@ from semloc_logs.alignment.icp import Fit, Step, Weighting, align
 from semloc_logs.alignment.mask_grid import (
     ANY_BIT,
     FREE_BIT,
+    MaskGrid,
     build_mask_grid,
     class_bits,
     look_up,
@@ -66,6 +67,10 @@ def block_map(cells: dict[Cell, int]) -> BlockMap:
     )
 
 
+def mask_grid_of(blocks: BlockMap) -> MaskGrid:
+    return build_mask_grid(blocks, blocks.occupied(), V, COARSE)
+
+
 def random_cells(seed: int, n: int = 120, low: int = -9, high: int = 11) -> dict[Cell, int]:
     rng = np.random.default_rng(seed)
     states = np.array([0, 2, 2, 5, 8, 13, 255, 254, 254, 254])
@@ -94,7 +99,7 @@ def test_class_bits_by_hand() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_masks_are_those_of_slow_loops(seed: int) -> None:
     cells = random_cells(seed)
-    grid = build_mask_grid(block_map(cells), V, COARSE)
+    grid = mask_grid_of(block_map(cells))
     corner = np.rint(grid.corner / V).astype(int)
     expected = np.zeros(grid.mask.shape, np.uint8)
     for ijk, state in cells.items():
@@ -111,7 +116,7 @@ def test_masks_are_those_of_slow_loops(seed: int) -> None:
 
 
 def test_look_ups_of_points() -> None:
-    grid = build_mask_grid(block_map({(0, 0, 0): 2, (9, 9, 9): 254}), V, COARSE)
+    grid = mask_grid_of(block_map({(0, 0, 0): 2, (9, 9, 9): 254}))
     points = np.array(
         [
             [0.25, 0.25, 0.25],
@@ -342,7 +347,7 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
         (40, 0, 0): 0,
         (60, 0, 0): 254,
     }
-    grid = build_mask_grid(block_map(target), V, COARSE)
+    grid = mask_grid_of(block_map(target))
     cells: dict[Cell, int] = {
         (0, 0, 0): 2,
         (12, 0, 0): 2,
@@ -358,7 +363,7 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
     free = {(20 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
     free |= {(60 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
     value, pose = search(
-        build_mask_grid(block_map(target | free), V, COARSE),
+        mask_grid_of(block_map(target | free)),
         evidence_of(cells, 4),
         np.zeros(4),
         (0.0,),
@@ -373,7 +378,7 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
 def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
     """Every turn and shift that is tried, one by one, by look-ups of turned and moved voxels."""
     rng = np.random.default_rng(seed)
-    grid = build_mask_grid(block_map(random_cells(seed, 500)), V, COARSE)
+    grid = mask_grid_of(block_map(random_cells(seed, 500)))
     e = evidence_of({c: s for c, s in random_cells(seed + 1, 30, -6, 7).items() if occupied(s)}, 8)
     start = np.r_[rng.uniform(-3, 3), rng.uniform(-0.5, 0.5, 3)]
     yaws = (-0.2, 0.0, 0.3)
@@ -402,9 +407,7 @@ def test_of_equally_good_poses_the_one_nearest_the_start_is_taken() -> None:
     """A wall along x holds nothing along it: the search stays where it began, and takes the least
     turn.
     """
-    grid = build_mask_grid(
-        block_map({(x, 0, z): 2 for x in range(-40, 40) for z in range(10)}), V, COARSE
-    )
+    grid = mask_grid_of(block_map({(x, 0, z): 2 for x in range(-40, 40) for z in range(10)}))
     cells: dict[Cell, int] = {(x, 0, z): 2 for x in range(-3, 4) for z in range(3, 6)}
     start = np.array([0.0, 0.3, 0.1, 0.2])
     _, pose = search(grid, evidence_of(cells, len(cells)), start, (0.02, -0.01, 0.0, 0.01), 2)

@@ -14,7 +14,7 @@ from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.settings import Fusion, ResolvedFusion, Settings
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
-from semloc_logs.voxels.keys import BLOCK
+from semloc_logs.voxels.keys import BLOCK, pack
 
 Cell = tuple[int, ...]
 Walk = Callable[..., NDArray[np.uint8]]
@@ -167,6 +167,26 @@ def test_votes(labels: list[int], winner: int) -> None:
     } == Counter(labels)
     # 0.85 each, clamped at 3.5
     assert blocks.log_odds[blocks.log_odds > 0].tolist() == [min(70, 17 * len(labels))]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_occupied_voxels_are_those_neither_free_nor_unobserved(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    usual = rng.choice([UNOBSERVED_STATE, FREE_STATE], (3, BLOCK**3)).astype(np.uint8)
+    any_state = rng.integers(0, 256, usual.shape).astype(np.uint8)  # unlabelled among them
+    state = np.where(rng.random(usual.shape) < [[0.01], [0.5], [1.0]], any_state, usual)
+    coordinates = np.array([[0, 0, 0], [0, 0, 1], [0, 2, -1]])
+    nothing = np.zeros(0, np.int64)
+    blocks = BlockMap(pack(coordinates), np.zeros(state.shape, np.int8), state, nothing, nothing)
+
+    ijk, label = blocks.occupied()
+    expected = [
+        (*(BLOCK * coordinates[n] + np.unravel_index(m, (BLOCK,) * 3)), value)
+        for n, values in enumerate(state)
+        for m, value in enumerate(values)
+        if value not in (FREE_STATE, UNOBSERVED_STATE)
+    ]
+    assert np.c_[ijk, label].tolist() == np.array(expected).tolist()
 
 
 def test_votes_do_not_overflow() -> None:
