@@ -19,6 +19,7 @@ from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel
 from semloc_logs.simulation.sensors.sensor import Sensor
 
 TURN_NS = 100_000_000  # duration of a sweep
+POSES_A_TURN = 21  # of the sensor: every 5 ms, of a trajectory's pose every 50
 PHASE = 0.37  # s by which the sensors of two drives of consecutive seeds begin apart
 
 
@@ -60,16 +61,16 @@ def simulate_drive(
     for number, stamp in enumerate(
         range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / sensor.rate_hz))
     ):
-        start, end = interpolate(
-            stamps, trajectory.world_T_base, np.array([stamp, stamp + TURN_NS])
-        )
+        during = stamp + np.linspace(0, TURN_NS, POSES_A_TURN).astype(np.int64)
+        path = interpolate(stamps, trajectory.world_T_base, during)
+        start = path[0]
         moment = (stamp - first) * 1e-9
         moving = traffic.scene(moment, start) if traffic else None
         lidar = start @ base_T_lidar
         options = SweepOptions(
             columns=sensor.columns,
             traffic=moving,
-            world_T_end=end @ base_T_lidar,
+            path=path @ base_T_lidar,
             moment=moment + PHASE * seed,
             wet=sensor.wet,
         )

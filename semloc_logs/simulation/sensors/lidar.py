@@ -39,17 +39,18 @@ class SweepOptions:
     """How one turn of a sensor differs from a whole one of a standing sensor on a dry road.
 
     Fewer ``columns``, a shorter ``max_range`` (m), an azimuth ``sector`` (rad). ``traffic`` is a
-    second scene, of what moves, that hides the first where it is nearer. With ``world_T_end``
-    (4, 4) the sensor moves during the turn and each point is in the frame of its own moment, as
-    real ones are. ``moment``: seconds into its pattern at which the sensor begins (None: at
-    random); ``wet`` in [0, 1]: how wet the road is.
+    second scene, of what moves, that hides the first where it is nearer. With a ``path``
+    (k, 4, 4), poses of the sensor in the world at even moments from the turn's start to its end,
+    the sensor moves and each point is in the frame of its own moment, as real ones are.
+    ``moment``: seconds into its pattern at which the sensor begins (None: at random); ``wet`` in
+    [0, 1]: how wet the road is.
     """
 
     columns: int | None = None
     max_range: float | None = None
     sector: tuple[float, float] | None = None
     traffic: Scene | None = None
-    world_T_end: F64 | None = None
+    path: F64 | None = None
     moment: float | None = None
     wet: float = 0.0
 
@@ -76,7 +77,7 @@ def full_sweep(
         ring,
         turn,
         world_T_lidar,
-        options.world_T_end,
+        options.path,
     )
     distance, labels, normal = _cast(scene, options.traffic, origin, rays)
     distance[is_blocked(model, directions)] = np.inf
@@ -136,21 +137,20 @@ def _pointed(rng: np.random.Generator, directions: F32, beams: int, sigma_deg: f
 
 
 def _rays(
-    directions: F32, lift: F32, ring: NDArray[np.uint16], turn: F64, start: F64, end: F64 | None
+    directions: F32, lift: F32, ring: NDArray[np.uint16], turn: F64, start: F64, path: F64 | None
 ) -> tuple[F32, F32]:
     """Directions and origins (n, 3) in the world for rays of a sensor that stands at ``start`` or
-    moves from there to ``end``.
+    moves along ``path``.
 
     ``lift`` (beams, 3) are the origins of the beams in the sensor frame.
     """
-    if end is None:
+    if path is None:
         rotation = start[:3, :3].astype(np.float32)
         return directions @ rotation.T, (lift @ rotation.T + start[:3, 3].astype(np.float32))[ring]
     # poses are a hundred microseconds apart at most: half a millimetre at 5 m/s
     moments = np.linspace(0, 1, 1001)
-    poses = interpolate(
-        np.array([0, 10**9]), np.stack([start, end]), (moments * 1e9).astype(np.int64)
-    ).astype(np.float32)
+    stamps = np.linspace(0, 10**9, len(path)).astype(np.int64)
+    poses = interpolate(stamps, path, (moments * 1e9).astype(np.int64)).astype(np.float32)
     poses = poses[np.round(turn * 1000).astype(np.int64)]
     rotation = poses[:, :3, :3]
     return np.einsum("nij,nj->ni", rotation, directions), rotation[:, :, 2] * lift[

@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 
 from semloc_logs.errors import LogError, SemlocError, SettingsError
 from semloc_logs.logs.inspection.inspect import inspect_log
-from semloc_logs.numerics.transforms import apply, interpolate, inverse, transform
+from semloc_logs.numerics.transforms import apply, interpolate, inverse, transform, yaw_transform
 from semloc_logs.simulation.demo import simulate_demo
 from semloc_logs.simulation.drive_plan import Route, Town, plan_sessions
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_drive
@@ -63,6 +63,26 @@ def test_drive_frames_are_on_time_and_in_place(
         points = apply(frame.world_T_base @ frame.base_T_lidar, frame.sweep.points)
         walls = points[frame.sweep.labels == WALL]
         assert np.median(np.abs(walls[:, 1])) == pytest.approx(5.5, abs=0.05)
+
+
+def test_points_are_where_the_vehicle_was_between_the_ends_of_a_sweep(
+    yard: World, trajectory: Trajectory
+) -> None:
+    poses = trajectory.world_T_base.copy()
+    poses[1::2] = poses[1::2] @ yaw_transform(0.03, (0.0, 0.0, 0.0))  # every other one: 50 ms
+    shaken = Trajectory(trajectory.stamps_ns, poses, poses)
+
+    def off_the_walls(trajectory: Trajectory) -> float:
+        """The median distance (m) of points from the walls."""
+        frame = list(simulate_drive(yard, trajectory, Sensor("vlp16", 2.0, 300)))[1]
+        moments = frame.stamp_ns + (frame.sweep.turn * 1e8).astype(np.int64)
+        placed = interpolate(trajectory.stamps_ns, trajectory.world_T_base, moments)
+        at_moments = placed @ frame.base_T_lidar
+        points = np.einsum("nij,nj->ni", at_moments[:, :3, :3], frame.sweep.points)
+        walls = (points + at_moments[:, :3, 3])[frame.sweep.labels == WALL]
+        return float(np.median(np.abs(np.abs(walls[:, 1]) - 5.5)))
+
+    assert off_the_walls(shaken) == pytest.approx(off_the_walls(trajectory), abs=0.005)
 
 
 def test_label_noise_leaves_the_points(

@@ -106,14 +106,19 @@ def test_traffic_hides_what_is_behind_it() -> None:
     assert not behind.any()
 
 
-def test_a_moving_sensor_measures_in_the_frame_of_each_moment() -> None:
-    start = yaw_transform(0.0, (0.0, 0.0, 1.9))
-    end = yaw_transform(0.1, (0.8, 0.1, 1.9))
-    turn = full_sweep(room(), start, np.random.default_rng(0), QUIET, SweepOptions(world_T_end=end))
-    still = apply(start, turn.points)
-    poses = interpolate(
-        np.array([0, 10**9]), np.stack([start, end]), (turn.turn * 1e9).astype(np.int64)
+@pytest.mark.parametrize("middle_yaw", [0.05, 0.02], ids=["evenly", "at changing rates"])
+def test_a_moving_sensor_measures_in_the_frame_of_each_moment(middle_yaw: float) -> None:
+    path = np.stack(
+        [
+            yaw_transform(0.0, (0.0, 0.0, 1.9)),
+            yaw_transform(middle_yaw, (0.4, 0.05, 1.9)),
+            yaw_transform(0.1, (0.8, 0.1, 1.9)),
+        ]
     )
+    turn = full_sweep(room(), path[0], np.random.default_rng(0), QUIET, SweepOptions(path=path))
+    still = apply(path[0], turn.points)
+    stamps = np.array([0, 5 * 10**8, 10**9])
+    poses = interpolate(stamps, path, (turn.turn * 1e9).astype(np.int64))
     moved = np.einsum("nij,nj->ni", poses[:, :3, :3], turn.points) + poses[:, :3, 3]
     assert misplaced(moved, turn.labels) < 2e-3
     assert misplaced(still, turn.labels) > 0.3
