@@ -16,10 +16,11 @@ F64 = NDArray[np.float64]
 NORMAL_NOISE = np.radians(2.0)  # of tangent planes
 LEAST_NOISE = 0.02  # m: of plane distances
 UNKNOWN_NOISE = 1.0  # m: of a fit without points
-# of the covariance, measured on simulated sweeps of six LIDARs from 0 to 40 m apart: neighbouring
-# points share their errors, and the fewer points meet a surface the more of them do so by chance
-LEAST_INFLATION = 2.0
-INFLATION_OF_SHARE = 0.5
+# of the covariance: neighbouring points share their errors, and the fewer points meet a surface the
+# more of them do so by chance. How it grows from 0 to 40 m was measured on simulated sweeps, which
+# need half of it; how large it is, on real ones
+LEAST_INFLATION = 1.0
+INFLATION_OF_SHARE = 0.25
 LEAST_SHARE = 0.05
 UNCERTAIN_INFLATION = 12.0  # where ranges are uncertain: all points of a wall are off alike
 # of the variance of the road between a pose and the keyframes that its map is made from: their
@@ -30,7 +31,7 @@ RANGE_BIAS = 1.0
 # share of the bias' variance that query and target have in common, and that cancels where both look
 # the same way
 COMMON_BIAS = 0.5
-FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
+FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad: mountings and stamps of real sensors
 
 
 def stiffness(fit: Fit) -> float:

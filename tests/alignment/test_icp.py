@@ -263,9 +263,9 @@ def held(
 @pytest.mark.parametrize(
     ("share", "uncertain", "inflation"),
     [
-        (1.0, False, 2.0),  # points share their errors: two count as one
-        (0.25, False, 8.0),  # of fewer points more meet a surface by chance: 0.5 / share^2
-        (0.01, False, 200.0),  # no less than 5 %
+        (1.0, False, 1.0),
+        (0.25, False, 4.0),  # of fewer points more meet a surface by chance: 0.25 / share^2
+        (0.01, False, 100.0),  # no less than 5 %
         (1.0, True, 12.0),
     ],
 )
