@@ -17,7 +17,6 @@ from semloc_logs.voxels.grid import Fuser
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-CACHED_KEYFRAMES = 64  # in memory: a query of 20 m and the next one
 POINTS_A_VOXEL = 2  # of a query along each edge
 
 
