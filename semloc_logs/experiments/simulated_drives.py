@@ -22,7 +22,7 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.camera_drive import simulate_cameras
 from semloc_logs.simulation.drives.drive import simulate_drive
 from semloc_logs.simulation.drives.traffic import random_traffic
-from semloc_logs.simulation.drives.trajectory import drive
+from semloc_logs.simulation.drives.trajectory import DAY_NS, START_NS, drive
 from semloc_logs.simulation.meshes.objects import resample
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.output.truth_file import write_truth
@@ -38,8 +38,6 @@ SEED = 500
 MAP, AGAIN, BACK = "map", "again", "back"
 LABEL_NOISE = 0.12  # share of wrong labels
 DRIFT = 0.007  # of the odometry, share of the way
-_START_NS = 1_760_000_000_000_000_000
-_DAY_NS = 86_400_000_000_000
 _TRAFFIC = 0.4  # vehicles on 100 m of road
 _CORNER = 4.0  # m over which corners are rounded
 _OFFSET = 0.5  # m to the left of the mapped line that it is driven again
@@ -219,7 +217,7 @@ def write_drive(town: Town, drive_: SimulatedDrive, folder: Path) -> Path:
         drive_.line,
         ground.slope_height,
         rng,
-        start_ns=_START_NS + number * _DAY_NS,
+        start_ns=START_NS + number * DAY_NS,
         speed=town.speed,
         drift=DRIFT,
     )

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.wgs84 import E2, FLATTENING, SEMI_MAJOR
+
 F64 = NDArray[np.float64]
-SEMI_MAJOR = 6378137.0
-FLATTENING = 1.0 / 298.257223563
 SCALE = 0.9996
 FALSE_EASTING = 500_000.0
 FALSE_NORTHING = 10_000_000.0  # south of the equator
@@ -71,7 +71,7 @@ class UtmZone:
         """Easting, northing and height (n, 3) of latitudes, longitudes (degrees) and heights."""
         latitude = np.radians(geodetic[:, 0])
         longitude = np.radians(geodetic[:, 1] - self.central_meridian_deg)
-        eccentricity = np.sqrt(FLATTENING * (2.0 - FLATTENING))
+        eccentricity = np.sqrt(E2)
         tangent = np.tan(latitude)
         sigma = np.sinh(
             eccentricity * np.arctanh(eccentricity * tangent / np.sqrt(1.0 + tangent**2))

@@ -15,7 +15,7 @@ from semloc_logs.simulation.drive_plan import Plan, Route, Session, Town, plan_s
 from semloc_logs.simulation.drives.camera_drive import CameraShot, simulate_cameras
 from semloc_logs.simulation.drives.drive import DriveFrame, simulate_drive
 from semloc_logs.simulation.drives.traffic import random_traffic
-from semloc_logs.simulation.drives.trajectory import drive
+from semloc_logs.simulation.drives.trajectory import DAY_NS, START_NS, drive
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.output.truth_file import write_truth
@@ -23,8 +23,6 @@ from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.tables.atomic_files import replacing_file
 
-_START_NS = 1_760_000_000_000_000_000
-_DAY_NS = 86_400_000_000_000
 _SPEEDS = 6.0, 8.0  # m/s, least and most of the sessions
 _TRAFFIC = 0.4  # vehicles on 100 m of road
 
@@ -96,7 +94,7 @@ def _write_session(
         session.line,
         ground.slope_height,
         rng,
-        start_ns=_START_NS + number * _DAY_NS,
+        start_ns=START_NS + number * DAY_NS,
         speed=float(rng.uniform(*_SPEEDS)),
         drift=sensor.drift,
     )

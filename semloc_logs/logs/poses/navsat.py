@@ -25,6 +25,7 @@ from semloc_logs.logs.poses.track import PoseTrack, is_time
 from semloc_logs.logs.problems import Problem, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
 from semloc_logs.numerics.transforms import rotation_between, transform, yaw_transform
+from semloc_logs.numerics.wgs84 import E2, FLATTENING, SEMI_MAJOR
 
 # m; a fix that is less certain than this, horizontally, does not resolve a street's width
 MAX_SIGMA = 5.0
@@ -39,19 +40,16 @@ _GRAVITY = np.array([0.0, 0.0, 9.80665])
 _LEAST_FORCE = 0.5 * _GRAVITY[2]  # m/s^2; a smaller mean force is not gravity
 _LONGEST_WAIT_NS = 5_000_000_000  # for a fix with an altitude; frames wait for their poses
 _MOST_WAITING = 100_000  # fixes; beyond, the oldest are forgotten
-_SEMI_MAJOR = 6378137.0
-_FLATTENING = 1.0 / 298.257223563
-_E2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
 def earth_centred(latitude_deg: float, longitude_deg: float, height: float) -> F64:
     """WGS 84 degrees and ellipsoid height (m) -> Earth-centred, Earth-fixed coordinates (3,), m."""
     lat = np.radians(latitude_deg)
     lon = np.radians(longitude_deg)
-    n = _SEMI_MAJOR / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
+    n = SEMI_MAJOR / np.sqrt(1.0 - E2 * np.sin(lat) ** 2)
     around = (n + height) * np.cos(lat)
     return np.array(
-        [around * np.cos(lon), around * np.sin(lon), (n * (1.0 - _E2) + height) * np.sin(lat)]
+        [around * np.cos(lon), around * np.sin(lon), (n * (1.0 - E2) + height) * np.sin(lat)]
     )
 
 
@@ -83,19 +81,19 @@ class LocalFrame:
         Bowring, Survey Review 28, 1985: below a millimetre for heights up to 10 km.
         """
         x, y, z = (positions @ self._enu_R_earth + self._origin).T
-        semi_minor = _SEMI_MAJOR * (1.0 - _FLATTENING)
+        semi_minor = SEMI_MAJOR * (1.0 - FLATTENING)
         around = np.hypot(x, y)
-        parametric = np.arctan2(z * _SEMI_MAJOR, around * semi_minor)
+        parametric = np.arctan2(z * SEMI_MAJOR, around * semi_minor)
         for _ in range(2):
             latitude = np.arctan2(
-                z + _E2 / (1.0 - _E2) * semi_minor * np.sin(parametric) ** 3,
-                around - _E2 * _SEMI_MAJOR * np.cos(parametric) ** 3,
+                z + E2 / (1.0 - E2) * semi_minor * np.sin(parametric) ** 3,
+                around - E2 * SEMI_MAJOR * np.cos(parametric) ** 3,
             )
-            parametric = np.arctan2((1.0 - _FLATTENING) * np.sin(latitude), np.cos(latitude))
-        curvature = _SEMI_MAJOR / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+            parametric = np.arctan2((1.0 - FLATTENING) * np.sin(latitude), np.cos(latitude))
+        curvature = SEMI_MAJOR / np.sqrt(1.0 - E2 * np.sin(latitude) ** 2)
         height = (
             around * np.cos(latitude)
-            + (z + _E2 * curvature * np.sin(latitude)) * np.sin(latitude)
+            + (z + E2 * curvature * np.sin(latitude)) * np.sin(latitude)
             - curvature
         )
         return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)

@@ -17,6 +17,8 @@ from semloc_logs.simulation.meshes.objects import resample
 from semloc_logs.simulation.meshes.world import F64
 
 POSES_HZ = 20.0  # of a trajectory
+START_NS = 1_760_000_000_000_000_000  # of the first drive
+DAY_NS = 86_400_000_000_000  # to the next one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

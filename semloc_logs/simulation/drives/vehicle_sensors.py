@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics.transforms import interpolate
+from semloc_logs.numerics.wgs84 import E2, SEMI_MAJOR
 from semloc_logs.simulation.drives.trajectory import Trajectory
 from semloc_logs.simulation.meshes.world import F64
 
@@ -20,9 +21,6 @@ I64 = NDArray[np.int64]
 GRAVITY = 9.80665  # m/s^2
 ANTENNA = np.array([-0.6, 0.0, 1.5])  # in the base frame (m)
 DATUM = 49.01, 8.42, 115.0  # degrees, degrees, m: where the world's origin lies; x is east, y north
-# WGS 84
-_SEMI_MAJOR = 6378137.0
-_FLATTENING = 1.0 / 298.257223563
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,22 +147,21 @@ def geodetic(enu: F64, datum: tuple[float, float, float] = DATUM) -> F64:
     Heights by repeated substitution (Hofmann-Wellenhof et al., GNSS, 2008, section 8.2.1): exact to
     a micrometre near the ground.
     """
-    e2 = _FLATTENING * (2.0 - _FLATTENING)
     lat = np.radians(datum[0])
     lon = np.radians(datum[1])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     north = np.cross(up, east)
-    n = _SEMI_MAJOR / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    n = SEMI_MAJOR / np.sqrt(1 - E2 * np.sin(lat) ** 2)
     origin = np.array(
-        [(n + datum[2]) * up[0], (n + datum[2]) * up[1], (n * (1 - e2) + datum[2]) * up[2]]
+        [(n + datum[2]) * up[0], (n + datum[2]) * up[1], (n * (1 - E2) + datum[2]) * up[2]]
     )
     x, y, z = (origin + enu @ np.stack([east, north, up])).T
     around = np.hypot(x, y)
     latitude = np.full(len(enu), lat)
     for _ in range(6):
-        n = _SEMI_MAJOR / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-        latitude = np.arctan2(z + e2 * n * np.sin(latitude), around)
-    n = _SEMI_MAJOR / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-    height = around * np.cos(latitude) + z * np.sin(latitude) - _SEMI_MAJOR**2 / n
+        n = SEMI_MAJOR / np.sqrt(1 - E2 * np.sin(latitude) ** 2)
+        latitude = np.arctan2(z + E2 * n * np.sin(latitude), around)
+    n = SEMI_MAJOR / np.sqrt(1 - E2 * np.sin(latitude) ** 2)
+    height = around * np.cos(latitude) + z * np.sin(latitude) - SEMI_MAJOR**2 / n
     return np.column_stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height])

@@ -11,7 +11,7 @@ import numpy as np
 
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting
-from semloc_logs.simulation.drives.trajectory import Trajectory, poses_along, smooth_line
+from semloc_logs.simulation.drives.trajectory import START_NS, Trajectory, poses_along, smooth_line
 from semloc_logs.simulation.meshes.world import F64, Scene
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.sensors.lidar import Sweep, SweepOptions, full_sweep
@@ -23,7 +23,6 @@ LAP_M = 250.0
 _SPACING = 2.0  # m between sweeps
 _POSES = 6  # poses of the odometry from one sweep to the next
 _STEP_NS = 48_000_000  # between poses: 7 m/s
-_START_NS = 1_760_000_000_000_000_000
 
 
 class Lap:
@@ -75,7 +74,7 @@ class Lap:
             for lap in range(laps)
         ]
         track = np.concatenate(poses)
-        stamps = _START_NS + _STEP_NS * np.arange(len(track), dtype=np.int64)
+        stamps = START_NS + _STEP_NS * np.arange(len(track), dtype=np.int64)
         return write_session(
             path, Trajectory(stamps, track, track), self._frames(track, steps, laps, onwards)
         )
@@ -86,7 +85,7 @@ class Lap:
             for k in range(len(self.sweeps) - 1, -1, -1) if back else range(len(self.sweeps)):
                 i = lap * steps + (steps - 1 - k * _POSES if back else k * _POSES)
                 yield DriveFrame(
-                    _START_NS + _STEP_NS * i, track[i], track[i], self.base_T_lidar, self.sweeps[k]
+                    START_NS + _STEP_NS * i, track[i], track[i], self.base_T_lidar, self.sweeps[k]
                 )
 
 

@@ -27,14 +27,13 @@ from semloc_logs.closures.closure import (
 from semloc_logs.closures.closure_tables import write_closures, write_rejected
 from semloc_logs.numerics.transforms import exp_se3, inverse
 from semloc_logs.settings import Settings
+from semloc_logs.simulation.drives.trajectory import DAY_NS, START_NS
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-START_NS = 1_760_000_000_000_000_000
-DAY_NS = 86_400_000_000_000
 VOXEL = 0.3  # m
 SPEED = 8.0  # m/s
 EVERY = 1.0  # m between keyframes
