@@ -34,16 +34,16 @@ def ground_bias(
     if int(is_level.sum()) < LEAST_POINTS:
         return np.zeros((3, 6))
 
-    up = normal[is_level] * np.sign(normal[is_level, 2:])
-    at = moved[met][is_level]
-    off = at - surface.points[index[is_level]]
-    above = np.einsum("ij,ij->i", off, up)
-    arm = at - centre
-    weight = STRIDE * surface.planar[index[is_level]] / (1 + (above / (KERNEL * radius)) ** 2)
-    weight *= np.linalg.norm(off, axis=1) < radius
+    upward = normal[is_level] * np.sign(normal[is_level, 2:])
+    on_ground = moved[met][is_level]
+    residual = on_ground - surface.points[index[is_level]]
+    height = np.einsum("ij,ij->i", residual, upward)
+    arm = on_ground - centre
+    weight = STRIDE * surface.planar[index[is_level]] / (1 + (height / (KERNEL * radius)) ** 2)
+    weight *= np.linalg.norm(residual, axis=1) < radius
 
     around = arm - arm.mean(0)
     width = max(float(np.sqrt(np.mean(around[:, :2] ** 2))), radius)
     shapes = np.stack([np.ones(len(arm)), around[:, 0] / width, around[:, 1] / width])
-    jacobian = np.concatenate([up, np.cross(arm, up)], axis=1)
-    return np.asarray(float(np.mean(above)) * (shapes * weight) @ jacobian)
+    jacobian = np.concatenate([upward, np.cross(arm, upward)], axis=1)
+    return np.asarray(float(np.mean(height)) * (shapes * weight) @ jacobian)

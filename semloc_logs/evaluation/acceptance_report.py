@@ -251,15 +251,15 @@ def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[di
     """How often alignments of each range of probability ``p`` (n,) are right."""
     out = []
     for a, b in pairwise(edges):
-        mine = (p >= a) & ((p < b) | (b == edges[-1]))
-        if mine.any():
+        is_inside = (p >= a) & ((p < b) | (b == edges[-1]))
+        if is_inside.any():
             out.append(
                 {
                     "from": a,
                     "to": b,
-                    "alignments": int(mine.sum()),
-                    "said": float(p[mine].mean()),
-                    "right": float(right[mine].mean()),
+                    "alignments": int(is_inside.sum()),
+                    "mean": float(p[is_inside].mean()),
+                    "right": float(right[is_inside].mean()),
                 }
             )
     return out
@@ -322,8 +322,8 @@ def _reliability_rows(bins: Sequence[dict[str, float]]) -> list[str]:
         "| probability, ordinary towns | alignments | mean | right |",
         "| --- | --- | --- | --- |",
     ]
-    for b in bins:
-        cells = [f"{b['from']:g} to {b['to']:g}", f"{b['alignments']:,}"]
-        cells += [f"{b['said']:.4f}", f"{b['right']:.4f}"]
+    for row in bins:
+        cells = [f"{row['from']:g} to {row['to']:g}", f"{row['alignments']:,}"]
+        cells += [f"{row['mean']:.4f}", f"{row['right']:.4f}"]
         rows.append("| " + " | ".join(cells) + " |")
     return rows

@@ -63,7 +63,8 @@ def map_sharpness(work: Workspace) -> Sharpness:
     placed = [_placed(work, SessionMap(folder)) for folder in folders]
     if not placed:
         return Sharpness(0, None, None, None, None)
-    edge = PLACE * float(read_metadata(folders[0].frames)["voxel_size"])
+    voxel = float(read_metadata(folders[0].frames)["voxel_size"])
+    edge = PLACE * voxel
     by_place: dict[tuple[str, int, int], list[_Placed]] = {}
     for part in placed:
         squares = np.unique(np.floor(part.after[:, :2, 3] / edge).astype(np.int64), axis=0)
@@ -78,8 +79,10 @@ def map_sharpness(work: Workspace) -> Sharpness:
         parts = by_place[frame, x, y]
         some = [parts[i] for i in evenly(len(parts), MOST_SESSIONS)]
         middle = (np.array([x, y]) + 0.5) * edge
-        for maps, figures in zip(_points_at(some, middle, edge), (before, after), strict=True):
-            figures.append(plane_figures(maps, CELL / PLACE * edge))
+        for maps, figures in zip(
+            _points_near(some, middle, REACH * voxel), (before, after), strict=True
+        ):
+            figures.append(plane_figures(maps, CELL * voxel))
     planes_before, thickness_before_m = _pooled(before)
     planes_after, thickness_after_m = _pooled(after)
     return Sharpness(
@@ -105,8 +108,10 @@ def rigidly_at(poses: F64, wanted: F64) -> F64:
     return np.asarray(move @ poses)
 
 
-def _points_at(parts: Sequence[_Placed], middle: F64, edge: float) -> tuple[list[F64], list[F64]]:
-    """Points (n, 3) of each session around ``middle`` (2,), before and after."""
+def _points_near(
+    parts: Sequence[_Placed], middle: F64, reach: float
+) -> tuple[list[F64], list[F64]]:
+    """Points (n, 3) of each session within ``reach`` (m) of ``middle`` (2,), before and after."""
     before: list[F64] = []
     after: list[F64] = []
     for part in parts:
@@ -114,10 +119,8 @@ def _points_at(parts: Sequence[_Placed], middle: F64, edge: float) -> tuple[list
         nearest = np.argsort(away, kind="stable")[:KEYFRAMES].tolist()
         for poses, maps in ((part.before, before), (part.after, after)):
             points = [apply(poses[k], part.session.keyframe(k).points) for k in nearest]
-            near = [
-                p[np.linalg.norm(p[:, :2] - middle, axis=1) < REACH / PLACE * edge] for p in points
-            ]
-            maps.append(np.concatenate(near))
+            inside = [p[np.linalg.norm(p[:, :2] - middle, axis=1) < reach] for p in points]
+            maps.append(np.concatenate(inside))
     return before, after
 
 
@@ -130,25 +133,26 @@ def plane_figures(maps: Sequence[F64], edge: float) -> tuple[int, F64]:
         return 0, np.zeros(0)
     owner = np.repeat(np.arange(len(maps)), [len(m) for m in maps])
     corner = np.floor(points / edge)
-    at = (corner - corner.min(0)).astype(np.int64)
-    _, wide, high = (at.max(0) + 1).tolist()
-    cells, cell = np.unique((at[:, 0] * wide + at[:, 1]) * high + at[:, 2], return_inverse=True)
+    i, j, k = (corner - corner.min(0)).astype(np.int64).T
+    cells, cell = np.unique((i * (j.max() + 1) + j) * (k.max() + 1) + k, return_inverse=True)
     count = np.bincount(cell, minlength=len(cells))
     pairs = np.unique(cell * len(maps) + owner)
     owners = np.bincount(pairs // len(maps), minlength=len(cells))
-    told = (count >= LEAST_POINTS) & (owners > 1)
+    is_judged = (count >= LEAST_POINTS) & (owners > 1)
 
     # about the corner of the cell: sums of squares lose digits with the distance
     local = points - corner * edge
     sums = np.stack([np.bincount(cell, local[:, k], len(cells)) for k in range(3)], axis=1)
-    off = local - (sums / count[:, None])[cell]
+    residual = local - (sums / count[:, None])[cell]
     covariance = np.empty((len(cells), 3, 3))
     for i in range(3):
         for j in range(3):
-            covariance[:, i, j] = np.bincount(cell, off[:, i] * off[:, j], len(cells)) / count
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[told]), 0.0))
+            covariance[:, i, j] = (
+                np.bincount(cell, residual[:, i] * residual[:, j], len(cells)) / count
+            )
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[is_judged]), 0.0))
     is_plane = spread[:, 0] < THIN * spread[:, 1]
-    return int(told.sum()), spread[is_plane, 0]
+    return int(is_judged.sum()), spread[is_plane, 0]
 
 
 def _pooled(figures: Sequence[tuple[int, F64]]) -> tuple[float | None, float | None]:

@@ -24,7 +24,7 @@ Bin = Mapping[str, float]
 
 
 def draw_reliability(path: Path, curves: Mapping[str, Sequence[Bin]]) -> None:
-    """PNG with one line for each of the ``curves``, of bins ``said``, ``right``, ``alignments``.
+    """PNG with one line for each of the ``curves``, of bins ``mean``, ``right``, ``alignments``.
 
     The axes are log-odds. The vertical strokes are one standard deviation of a binomial share
     (Agresti and Coull, 1998).
@@ -50,7 +50,7 @@ def draw_reliability(path: Path, curves: Mapping[str, Sequence[Bin]]) -> None:
 def _draw_curve(axes: Axes, name: str, bins: Sequence[Bin], colour: Colour) -> None:
     """A line through the bins, with the uncertainty and the number of alignments of each."""
     shade = web_colour(colour)
-    probability = np.array([b["said"] for b in bins])
+    probability = np.array([b["mean"] for b in bins])
     share = np.array([b["right"] for b in bins])
     count = np.array([b["alignments"] for b in bins])
     x, y = np.clip([probability, share], *LIMITS)

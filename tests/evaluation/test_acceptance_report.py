@@ -27,8 +27,8 @@ def test_reliability_by_hand() -> None:
     p = np.array([0.05, 0.15, 0.95, 0.97])
     right = np.array([False, True, True, True])
     assert reliability(p, right, (0.0, 0.5, 1.0)) == [
-        {"from": 0.0, "to": 0.5, "alignments": 2, "said": pytest.approx(0.1), "right": 0.5},
-        {"from": 0.5, "to": 1.0, "alignments": 2, "said": pytest.approx(0.96), "right": 1.0},
+        {"from": 0.0, "to": 0.5, "alignments": 2, "mean": pytest.approx(0.1), "right": 0.5},
+        {"from": 0.5, "to": 1.0, "alignments": 2, "mean": pytest.approx(0.96), "right": 1.0},
     ]
 
 

@@ -28,7 +28,7 @@ def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_wha
     assert together.recall > alone.recall + 0.1
     assert together.false <= 0.03 * together.accepted
     for row in reliability(fitted.probability, data.right, (0.0, 0.2, 0.8, 1.0)):
-        assert abs(row["said"] - row["right"]) < max(0.06, 2.5 / np.sqrt(row["alignments"]))
+        assert abs(row["mean"] - row["right"]) < max(0.06, 2.5 / np.sqrt(row["alignments"]))
     content = calibration_json(data, fitted)
     assert (content["towns"], content["alignments"], content["right"]) == (
         3,

@@ -41,8 +41,10 @@ def add_evident_faults(stream: StreamFit, session: Session, clouds: Clouds) -> N
     )
     if cause:
         stream.findings = [Finding(Severity.WRONG, cause)]
-    _lead(stream, session.lead_of(topic), clouds)
-    _off_stamp(stream, session.off_stamp_of(topic), clouds)
+    lead = session.lead_of(topic)
+    _add(stream, lead, clouds, _lead_text(topic, lead))
+    off_stamp = session.off_stamp_of(topic)
+    _add(stream, off_stamp, clouds, _off_stamp_text(off_stamp))
 
 
 def _stuck(session: Session, topic: str) -> str:
@@ -112,32 +114,29 @@ def _far_clock_text(topic: str, shift: float) -> str:
     )
 
 
-def _lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
-    """Stamps that are later than their recording are wrong, also where the drive does not show it.
+def _add(stream: StreamFit, seconds: float, clouds: Clouds, text: str) -> None:
+    """Enters times that are ``seconds`` wrong where the vehicle is far off by then.
 
-    A steady drive along a street hides a clock.
+    Also where the drive does not show it: a steady drive along a street hides a clock. Nothing is
+    added to another finding.
     """
-    if stream.findings or lead * clouds.rates[0] < WRONG * clouds.voxel:
-        return
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
-            " poses are not: its clock is another one, or was set; give --set logs.time_offset."
-            f"{stream.topic}={-lead:+.2f} where this holds for the whole log, else cut the log",
-        )
+    if not stream.findings and seconds * clouds.rates[0] >= WRONG * clouds.voxel:
+        stream.findings.append(Finding(Severity.WRONG, text))
+
+
+def _lead_text(topic: str, lead: float) -> str:
+    """Stamps that are later than their recording."""
+    return (
+        f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
+        " poses are not: its clock is another one, or was set; give --set logs.time_offset."
+        f"{topic}={-lead:+.2f} where this holds for the whole log, else cut the log"
     )
 
 
-def _off_stamp(stream: StreamFit, seconds: float, clouds: Clouds) -> None:
-    """Times of points and of their header that contradict each other, wherever it matters."""
-    if stream.findings or seconds * clouds.rates[0] < WRONG * clouds.voxel:
-        return
-    stream.findings.append(
-        Finding(
-            Severity.WRONG,
-            f"its points were all measured {seconds:.2f} s or more before or after the stamp of"
-            " their sweep: the stamps or the times of the points are wrong; record sweeps with"
-            " times that agree",
-        )
+def _off_stamp_text(seconds: float) -> str:
+    """Times of points and of their header that contradict each other."""
+    return (
+        f"its points were all measured {seconds:.2f} s or more before or after the stamp of"
+        " their sweep: the stamps or the times of the points are wrong; record sweeps with"
+        " times that agree"
     )
