@@ -9,7 +9,6 @@ where the check spends its time.
 
 from __future__ import annotations
 
-import argparse
 import cProfile
 import pstats
 import tempfile
@@ -17,7 +16,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from fit_detection import read
+from fit_detection import options_of, read
 
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.settings import load
@@ -26,12 +25,7 @@ from semloc_logs.workspace import SessionFolder
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("logs", nargs="+", type=Path)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--profile", action="store_true")
-    options = parser.parse_args()
-    assignments = dict(text.split("=", 1) for text in options.set)
+    options, assignments = options_of(__doc__, "--profile")
     print("| log | way (m) | keyframes | fusing (s/km) | check (s/km) | share (%) |")
     print("| --- | --- | --- | --- | --- | --- |")
     for log in options.logs:

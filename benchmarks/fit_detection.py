@@ -169,14 +169,19 @@ def row_of(drive: Drive) -> dict[str, Any]:
     return row
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def options_of(description: str, flag: str) -> tuple[argparse.Namespace, dict[str, str]]:
+    """The options of a script on logs, which has one flag, and its settings by key."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("logs", nargs="+", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument(flag, action="store_true")
     options = parser.parse_args()
-    assignments = dict(text.split("=", 1) for text in options.set)
+    return options, dict(text.split("=", 1) for text in options.set)
+
+
+def main() -> None:
+    """Print the table."""
+    options, assignments = options_of(__doc__, "--json")
     columns = ("log", "way (m)", "speed (m/s)", "turn rate (deg/s)", *SIZES, "check (s/km)")
     if not options.json:
         print("| " + " | ".join((*columns, "alarms")) + " |")
