@@ -89,6 +89,8 @@ INNER_ORDER = {
         "hypotheses",
         "mask_grid",
         "tau",
+        "cell_masks",
+        "overlaps",
         "surface",
         "icp",
         "query_map",

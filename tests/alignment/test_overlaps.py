@@ -8,15 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.overlaps import (
+from semloc_logs.alignment.cell_masks import (
     NOT_ALIGNED,
+    OverlapMap,
+    class_bit,
+    look_up,
+    overlap_map,
+)
+from semloc_logs.alignment.overlaps import (
     Shifts,
     aligned_pairs,
     best_overlaps,
-    class_bit,
-    mask_of_cell,
     overlap,
-    overlap_map,
     query_voxels,
 )
 from semloc_logs.alignment.tau import tau
@@ -25,6 +28,11 @@ from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, pack
 
 ROAD, WALL = 0, 2
+
+
+def mask_of_cell(target: OverlapMap, cell: tuple[int, int, int]) -> int:
+    """The bits of all voxels that may be closest to a point in the cell."""
+    return int(look_up(target.arrays, *cell, target.offsets))
 
 
 def blocks_of(voxels: dict[tuple[int, int, int], int]) -> BlockMap:

@@ -15,8 +15,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.alignment.cell_masks import overlap_map
 from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
-from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
+from semloc_logs.alignment.overlaps import overlap, query_voxels
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.answers import Learner, Run, answer_scenario
 from semloc_logs.experiments.scenarios import time_scenario

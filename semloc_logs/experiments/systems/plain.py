@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
+from semloc_logs.alignment.cell_masks import OverlapMap, overlap_map
 from semloc_logs.alignment.overlaps import (
-    OverlapMap,
     Shifts,
     Voxels,
     aligned_pairs,
     best_overlaps,
-    overlap_map,
     query_voxels,
 )
 from semloc_logs.experiments.kept_files import kept_file

@@ -17,8 +17,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from semloc_logs.alignment.cell_masks import overlap_map
 from semloc_logs.alignment.hypotheses import non_maximum_suppression, pose_matrix
-from semloc_logs.alignment.overlaps import Voxels, overlap, overlap_map, query_voxels
+from semloc_logs.alignment.overlaps import Voxels, overlap, query_voxels
 from semloc_logs.experiments.system import MOST_POSES
 from semloc_logs.experiments.systems.level_maps import LevelMap
 from semloc_logs.experiments.systems.plain import refined
