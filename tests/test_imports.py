@@ -47,6 +47,7 @@ ORDER = [
 ]
 # sub-rooms and modules of a room that stands in an order of its own; what is not named stands last
 INNER_ORDER = {
+    "settings": ["sections", "configuration", "sources"],
     "logs": [
         "problems",
         "remote",

@@ -1,46 +1,31 @@
-"""All settings with their defaults beside them: defaults < YAML file < environment
-(``SEMLOC_FUSION__VOXEL_SIZE``) < flags.
+"""The sections of the settings: every setting with its default, its unit and its meaning.
 
-Unknown keys are refused at every level, by name. Lengths that are ``None`` follow the voxel size
-(0.30 m is the paper's street scale; a room at 0.05 m is a street in miniature) and are filled in by
-:meth:`Settings.resolved`, the only place that does so.
+Lengths that are ``None`` follow the voxel size (0.30 m is the paper's street scale; a room at
+0.05 m is a street in miniature).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from semloc_logs.errors import SettingsError, did_you_mean
-from semloc_logs.schemas import names, read_text
-
-STREET_VOXEL = 0.30
-# sections that the tables of a workspace depend on, and settings in them that change no table
-TABLE_SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
-OF_MACHINE = frozenset({"logs.memory", "labels.threads", "training.method"})
 MOST_VOXELS = 1000
 _UNIT = 1e-2  # of a quaternion's squared length, off 1: people write few digits
-_MOST_BYTES = 1 << 20  # of a YAML file
 _LARGEST_OFFSET = 2e9  # s, of stamps: more than from 1970 to now
-_BY_TOPIC = "logs.time_offset."  # the rest of such a key is a topic, which may have dots
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
-
-
 Pose = tuple[float, float, float, float, float, float, float]  # x, y, z, qx, qy, qz, qw
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """Refuses unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Logs(_Section):
+class Logs(Section):
     """How logs are read; everything here overrules what the log itself says."""
 
     stamps: Literal["auto", "header", "log"] = Field(
@@ -112,7 +97,7 @@ class Logs(_Section):
         return self
 
 
-class Fusion(_Section):
+class Fusion(Section):
     """Keyframes, submaps and the voxel map (paper 3.1)."""
 
     voxel_size: float = Field(0.30, gt=0.005, le=5.0, description="edge of a voxel (m)")
@@ -177,7 +162,7 @@ class Fusion(_Section):
         return self
 
 
-class Labels(_Section):
+class Labels(Section):
     """Source of the classes (paper 3.1); recorded in session.json and in every table."""
 
     source: LabelSource = Field(
@@ -213,7 +198,7 @@ class Labels(_Section):
     )
 
 
-class Descriptor(_Section):
+class Descriptor(Section):
     """Subvolumes and their descriptors (paper 3.2)."""
 
     variant: Literal["auto", "semantic", "geometric"] = Field(
@@ -248,7 +233,7 @@ class Descriptor(_Section):
     )
 
 
-class Query(_Section):
+class Query(Section):
     """Which queries are made (paper 3, 4.4)."""
 
     frames: int = Field(
@@ -275,7 +260,7 @@ class Query(_Section):
     )
 
 
-class Closures(_Section):
+class Closures(Section):
     """From word matches to accepted closures (paper 3.4, 3.5)."""
 
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
@@ -341,7 +326,7 @@ class Closures(_Section):
     )
 
 
-class Optimize(_Section):
+class Optimize(Section):
     """The pose graph of all sessions and their closures."""
 
     odometry_drift: float = Field(
@@ -380,7 +365,7 @@ class Optimize(_Section):
     )
 
 
-class Training(_Section):
+class Training(Section):
     """The encoder-decoder's training (supplement 1)."""
 
     method: Literal["ours", "paper"] = Field(
@@ -420,7 +405,7 @@ class Training(_Section):
     seed: int = 0
 
 
-class Plain(_Section):
+class Plain(Section):
     """The paper's method as written, in the experiments (paper 3, 4.2 and supplement 1)."""
 
     headings: int = Field(
@@ -499,111 +484,6 @@ class ResolvedOptimize(Optimize):
     vertex_spacing: float
 
 
-class Settings(_Section):
-    """The whole configuration as given; see each section."""
-
-    logs: Logs = Logs()
-    fusion: Fusion = Fusion()
-    labels: Labels = Labels()
-    descriptor: Descriptor = Descriptor()
-    query: Query = Query()
-    closures: Closures = Closures()
-    optimize: Optimize = Optimize()
-    training: Training = Training()
-    plain: Plain = Plain()
-
-    def resolved(self) -> Resolved:
-        """The same settings with every ``None`` length filled in from the voxel size, and absolute
-        paths.
-
-        Raises SettingsError where lengths do not go together.
-        """
-        fusion = self.fusion
-        v = fusion.voxel_size
-        scale = v / STREET_VOXEL
-        submap_length = _given(fusion.submap_length, 100 * scale)
-        if self.query.length is not None and self.query.length > 2 * submap_length:
-            raise SettingsError(
-                f"Setting 'query.length' cannot be {self.query.length:g} m: a query is looked for"
-                f" in submaps of {submap_length:g} m, and may be twice as long; make"
-                " fusion.submap_length larger, too."
-            )
-        query_every = _given(self.query.every, 2 * scale)
-        lengths: dict[str, dict[str, float]] = {
-            "fusion": {
-                "min_range": 3 * v,
-                "max_range": 50 * scale,
-                "keyframe_distance": 2 * v,
-                "keyframe_resolution": v / 3,
-                "submap_length": 100 * scale,
-            },
-            "descriptor": {"reach": 30 * scale},
-            "query": {"every": query_every, "radius": 24 * scale},
-            "closures": {"exclude_distance": 50 * scale, "every": 4 * query_every},
-            "optimize": {"closure_sigma": v / 3, "vertex_spacing": 5 * scale},
-        }
-        content = self.model_dump()
-        for section, defaults in lengths.items():
-            for name, length in defaults.items():
-                content[section][name] = _given(content[section][name], length)
-        # a workspace keeps them, and its next command may run elsewhere
-        for values in content.values():
-            values |= {k: v.absolute() for k, v in values.items() if isinstance(v, Path)}
-        return Resolved.model_validate(content)
-
-    def tables(self, *sections: str) -> dict[str, dict[str, Any]]:
-        """The named sections, of those only the settings that tables depend on."""
-        dumped = self.model_dump(mode="json", include=set(sections))
-        return {
-            section: {k: v for k, v in values.items() if f"{section}.{k}" not in OF_MACHINE}
-            for section, values in dumped.items()
-        }
-
-    def fingerprint(self, *sections: str) -> str:
-        """Hash of the named sections: what a stage's outputs depend on."""
-        dumped = json.dumps(self.tables(*sections), sort_keys=True)
-        return hashlib.sha256(dumped.encode()).hexdigest()[:16]
-
-    def given(self) -> dict[str, Any]:
-        """The settings that were given, by key path, as JSON has them; defaults are left out."""
-        return {
-            f"{section}.{name}": value
-            for section in self.model_fields_set
-            for name, value in getattr(self, section)
-            .model_dump(mode="json", exclude_unset=True)
-            .items()
-        }
-
-    def dump(self) -> str:
-        """YAML that :func:`load` reads back to the same settings."""
-        return str(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
-
-
-class Resolved(Settings):
-    """The configuration as the stages use it: every length is there."""
-
-    fusion: ResolvedFusion
-    descriptor: ResolvedDescriptor
-    query: ResolvedQuery
-    closures: ResolvedClosures
-    optimize: ResolvedOptimize
-
-    def resolved(self) -> Resolved:
-        return self
-
-    def differences(self) -> dict[str, dict[str, Any]]:
-        """The settings of the tables that neither defaults nor the voxel size give, by section."""
-        voxel_size = self.fusion.voxel_size
-        expected = Settings(fusion=Fusion(voxel_size=voxel_size)).resolved().tables(*TABLE_SECTIONS)
-        out = {
-            section: {k: v for k, v in values.items() if v != expected[section][k]}
-            for section, values in self.tables(*TABLE_SECTIONS).items()
-        }
-        if voxel_size != STREET_VOXEL:
-            out["fusion"]["voxel_size"] = voxel_size
-        return {section: values for section, values in out.items() if values}
-
-
 def _direction(text: str) -> tuple[float, float, float] | None:
     """A vector from an axis or from three numbers; None for auto. ValueError for other text."""
     if text == "auto":
@@ -619,138 +499,3 @@ def _direction(text: str) -> tuple[float, float, float] | None:
     if not 1e-9 < math.hypot(x, y, z) < math.inf:
         raise ValueError("up needs a vector of finite length other than zero")
     return x, y, z
-
-
-def _given(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-class _Loader(yaml.SafeLoader):
-    """Without aliases: a few lines of aliases of aliases stand for more than any memory holds."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(None, None, "aliases are not supported", None)
-        return super().compose_node(parent, index)
-
-
-def _from_yaml(text: str) -> Any:
-    """ValueError for other text; the values of tags and dates raise many other types."""
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        RecursionError,
-    ) as problem:
-        raise ValueError(" ".join(str(problem).split())[:200].rstrip(".")) from None
-
-
-def read_yaml(path: Path, what: str) -> Any:
-    """The content of the YAML file ``path``. SettingsError, which calls it ``what``, when it cannot
-    be read or is larger than 1 MiB.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise SettingsError(f"{what} {path} is larger than a megabyte: name another file.")
-        return _from_yaml(content.decode())
-    except (OSError, ValueError) as problem:
-        raise SettingsError(f"{what} {path} cannot be read as YAML: {problem}.") from None
-
-
-def load(
-    file: Path | None = None,
-    assignments: Mapping[str, str] | None = None,
-    environment: Mapping[str, str] | None = None,
-    method: str | None = None,
-) -> Settings:
-    """Settings from defaults < ``method`` < ``file`` (YAML) < ``environment`` < ``assignments``
-    (``key.path`` -> YAML value).
-
-    A ``method`` is a settings file of the package (schemas/methods). Raises SettingsError naming
-    the key when it is unknown or its value impossible.
-    """
-    merged: dict[str, Any] = {}
-    if file is not None:
-        content = read_yaml(file, "Settings file")
-        if content is not None and not isinstance(content, dict):
-            raise SettingsError(
-                f"Settings file {file} does not hold a mapping of sections such as 'fusion:'."
-            )
-        # a section may be empty
-        merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}
-    if method is not None:
-        for section, values in _method(method).items():
-            given = merged.setdefault(section, {})
-            merged[section] = {**values, **given} if isinstance(given, dict) else given
-    for name, value in (environment or {}).items():
-        if name.startswith("SEMLOC_") and "__" in name:
-            _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
-    for key, value in (assignments or {}).items():
-        _assign(merged, key, value)
-    return validated(merged)
-
-
-def _method(name: str) -> dict[str, dict[str, Any]]:
-    """The sections of a named method; SettingsError for another name."""
-    known = names("methods", ".yaml")
-    if name not in known:
-        raise SettingsError(f"Unknown method '{name}': there are {', '.join(known)}.")
-    content: dict[str, dict[str, Any]] = _from_yaml(read_text(f"methods/{name}.yaml"))
-    return content
-
-
-def validated(content: Mapping[str, Any]) -> Settings:
-    """The settings of a mapping of sections. SettingsError names a key that is wrong."""
-    try:
-        return Settings.model_validate(content)
-    except ValidationError as problem:
-        first = problem.errors()[0]
-        key = ".".join(str(p) for p in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise SettingsError(
-                f"Unknown setting '{key}': 'semloc run --dump-config' prints every key."
-                f"{did_you_mean(key, _keys())}"
-            ) from None
-        raise SettingsError(
-            f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}."
-        ) from None
-
-
-def _keys() -> list[str]:
-    """Every section, and every setting by its key path."""
-    sections = {name: type(values).model_fields for name, values in Settings()}
-    return [*sections, *(f"{name}.{key}" for name, fields in sections.items() for key in fields)]
-
-
-def choices() -> dict[str, tuple[str, ...]]:
-    """The key of every setting, with its values where it has a few fixed ones."""
-    found: dict[str, tuple[str, ...]] = {}
-    for section, values in Settings():
-        for name, field in type(values).model_fields.items():
-            kinds = (field.annotation, *get_args(field.annotation))
-            fixed = [v for kind in kinds if get_origin(kind) is Literal for v in get_args(kind)]
-            of_switch = ("true", "false") if bool in kinds else ()
-            found[f"{section}.{name}"] = tuple(map(str, fixed)) or of_switch
-    return found
-
-
-def _assign(tree: dict[str, Any], key: str, value: str) -> None:
-    if key.startswith(_BY_TOPIC):
-        *parents, last = (*_BY_TOPIC.strip(".").split("."), key.removeprefix(_BY_TOPIC))
-    else:
-        *parents, last = key.split(".")
-    for part in parents:
-        child = tree.setdefault(part, {})
-        if not isinstance(child, dict):
-            raise SettingsError(f"Unknown setting '{key}': '{part}' is not a section.")
-        tree = child
-    try:
-        tree[last] = _from_yaml(value)
-    except ValueError:
-        raise SettingsError(f"Setting '{key}' has a value that is not YAML: {value!r}.") from None
