@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 import types
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -215,7 +216,13 @@ def reasons_page() -> str:
 
 
 def _page(parts: Iterable[str]) -> str:
-    return "\n\n".join([NOTICE, *parts]) + "\n"
+    """The parts with empty lines between them; prose in lines of at most 100 characters."""
+    wrapped = [part if part.startswith(("#", "|", "```")) else _wrapped(part) for part in parts]
+    return "\n\n".join([NOTICE, *wrapped]) + "\n"
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, 100, break_long_words=False, break_on_hyphens=False)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
