@@ -1,6 +1,6 @@
-"""A disk that loses what was not synced: every state that a crash may leave of a watched folder.
+"""A disk that loses unsynced writes: every state that a crash may leave of a watched folder.
 
-The model: a crash keeps what was synced and any subset of the rest. Content of a file is durable by
+The model: a crash keeps synced writes and any subset of the rest. Content of a file is durable by
 an fsync of the file; names in a folder (creations, renames, removals) by an fsync of the folder.
 A write consists of blocks, and each block may be lost by itself.
 """
@@ -89,7 +89,7 @@ def _renamed(names: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
 
 
 class LossyDisk:
-    """Watches what is written below ``root``; all that is there at the start is durable.
+    """Watches all writes below ``root``; all that is there at the start is durable.
 
     ``block``: bytes that are written or lost together. ``visit`` is called before each step
     (a sync, or a change by a function of ``os``) and may look at :meth:`states`.

@@ -37,7 +37,7 @@ class WebServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}"
 
     def handle_error(self, *_: object) -> None:
-        """A client that went away is no news."""
+        """A client that went away needs no message."""
 
 
 class _Handler(BaseHTTPRequestHandler):

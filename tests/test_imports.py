@@ -1,4 +1,4 @@
-"""One import direction, read from the source: a module imports only what stands before it in the
+"""One import direction, read from the source: a module imports only modules before it in the
 story.
 """
 
@@ -14,7 +14,7 @@ import pytest
 from semloc_logs.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
-# rooms in the order of the story; a room imports only what stands above it
+# rooms in the order of the story; a room imports only rooms above it
 ORDER = [
     "errors",
     "progress",
@@ -45,7 +45,7 @@ ORDER = [
     "experiments",
     "api",
 ]
-# sub-rooms and modules of a room that stands in an order of its own; what is not named stands last
+# sub-rooms and modules of a room that stands in an order of its own; the others stand last
 INNER_ORDER = {
     "settings": ["sections", "configuration", "sources"],
     "logs": [

@@ -176,7 +176,7 @@ def test_lengths_follow_the_voxel_size() -> None:
                 assert small == pytest.approx(wide / 6), name
             elif name != "voxel_size":
                 assert small == wide == before, name
-    assert room.query.length is None  # not asked for: a query has query.frames keyframes
+    assert room.query.length is None  # not set: a query has query.frames keyframes
     assert room.resolved() == room
     kept = load(
         assignments={"fusion.voxel_size": "0.05", "fusion.max_range": "20", "fusion.min_range": "0"}

@@ -330,7 +330,7 @@ def test_covariance_of_position_and_angles_turns_with_the_target(yaw: float) -> 
     "arm", [(10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (3.0, -4.0, 5.0)]
 )
 def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float, float]) -> None:
-    """The base is ``arm`` away from the aligned points: its covariance is that of the points,
+    """The base is ``arm`` away from the aligned points: it has the points' covariance,
     moved by a Jacobian of finite differences.
     """
     half = np.random.default_rng(4).normal(size=(6, 6)) * 30

@@ -135,7 +135,7 @@ def test_it_equals_the_slow_one(
 
 @pytest.mark.parametrize("is_full", [False, True])
 def test_a_voxel_within_others_is_closest_to_points_in_it(is_full: bool) -> None:
-    """Road within a wall: it is not at the border of what was observed."""
+    """Road within a wall: it is not at the border of the observed voxels."""
     voxels = {(x, y, z): WALL for x in range(5) for y in range(5) for z in range(5)}
     target = overlap_map(blocks_of(voxels | {(2, 2, 2): ROAD}), 3.0)
     if is_full:  # the palette has no room for masks, so that every voxel is looked for

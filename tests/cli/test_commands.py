@@ -205,7 +205,7 @@ def test_run_prints_its_report_as_json(called: Any, tmp_path: Path) -> None:
             done=["fuse a"],
             kept=["describe a"],
             skipped=["a: lost."],
-            failed=["b is no log."],
+            failed=["b is not a log."],
             seconds={"fuse": 1.5},
             closures=7,
         ),
@@ -217,11 +217,11 @@ def test_run_prints_its_report_as_json(called: Any, tmp_path: Path) -> None:
         "done": ["fuse a"],
         "kept": ["describe a"],
         "skipped": ["a: lost."],
-        "failed": ["b is no log."],
+        "failed": ["b is not a log."],
         "seconds": {"fuse": 1.5},
         "closures": 7,
     }
-    assert done.stderr.splitlines() == ["Warning: a: lost.", "Warning: b is no log."]
+    assert done.stderr.splitlines() == ["Warning: a: lost.", "Warning: b is not a log."]
 
 
 def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def drive(
     stamps: Sequence[float] | None = None,
 ) -> Path:
     """A log of odometry (time, x), and of sweeps at the times ``sweeps`` that carry ``stamps``;
-    what is listed later is recorded later.
+    messages listed later are recorded later.
     """
     messages: list[tuple[float, str, Any]] = []
     for k, (t, x) in enumerate(poses):

@@ -73,7 +73,7 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluation]
 
 
 def between(evaluation: Evaluation, one: str, other: str) -> list[Judged]:
-    """Either may have asked: what is found from both ends is kept once."""
+    """Either may be the query: a closure found from both ends is kept once."""
     return [
         row for row in evaluation.rows if {row.query_session, row.target_session} == {one, other}
     ]

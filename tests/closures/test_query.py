@@ -130,7 +130,7 @@ def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
         expected.append(apply(yaw_transform(0.0, (-1001.0, -50.0, -3.0)) @ poses[i], kept))
     every = np.concatenate(expected)
     distance = np.linalg.norm(query.points[:, None] - every[None], axis=2).min(1)
-    assert distance.max() < 1e-5  # nothing but what was seen, thinned
+    assert distance.max() < 1e-5  # nothing but seen points, thinned
     assert len(query.points) > 0.5 * len(every)
     assert len(np.unique(np.floor(query.points / 0.15).astype(int), axis=0)) >= 0.99 * len(
         query.points

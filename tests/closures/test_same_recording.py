@@ -14,7 +14,7 @@ S = 1_000_000_000
 
 
 def session(first: int, last: int, seed: int = 0) -> Any:
-    """Keyframes each second; ``seed`` decides what is seen at a time."""
+    """Keyframes each second; ``seed`` decides the points of each."""
     means = np.random.default_rng(seed).normal(size=(100, 3))[first:last]
     stamps_ns = np.arange(first, last) * S
     return cast(

@@ -160,7 +160,7 @@ def test_recall_is_unknown_without_revisits(tmp_path: Path) -> None:
 
 
 def test_a_session_revisits_itself_apart_from_what_is_near(tmp_path: Path) -> None:
-    """Out to x = 100 and back: keyframes of the way back lie on those of the way out, later than 30
+    """Out to x = 100 and back: keyframes of the way back lie on earlier ones, later than 30
     s and farther than 50 m of road.
     """
     work = Workspace(tmp_path / "work")

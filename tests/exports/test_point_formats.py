@@ -111,7 +111,7 @@ def read_pcd(path: Path) -> Cloud:
     rows = np.frombuffer(body, list(zip(says["FIELDS"], kinds, strict=True)))
     assert len(rows) == int(says["POINTS"][0]) == int(says["WIDTH"][0])
     rgb = rows["rgb"].copy().view(np.uint32)
-    assert says["TYPE"][-1] == "F"  # what PCL asks of a field rgb
+    assert says["TYPE"][-1] == "F"  # as PCL needs a field rgb
     return (
         np.stack([rows[c] for c in "xyz"], 1).astype(float),
         rows["label"].astype(int),

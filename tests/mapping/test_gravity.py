@@ -49,7 +49,7 @@ def street() -> F64:
     ground = plane(np.array([-12.0, -7.0, -HEIGHT]), 24 * X, 16 * Y)
     right = plane(np.array([-12.0, -7.0, -HEIGHT]), 24 * X, 6 * Z)
     left = plane(np.array([-12.0, 9.0, -HEIGHT]), 24 * X, 5 * Z)
-    # crowns of trees, and what is seen through windows
+    # crowns of trees, and points behind windows
     trees = rng.uniform((-12, -6, 1), (12, -4, 4), (800, 3))
     rooms = rng.uniform((-12, 9, -1.5), (12, 13, 3), (400, 3))
     return np.concatenate([ground, right, left, trees, rooms])
@@ -91,7 +91,7 @@ def test_up_is_found_in_any_axes(turn: F64) -> None:
     assert found.source is UpSource.MAP
     assert found.margin is not None
     assert found.margin > 0.1
-    # what was found against the convention is a note, what was expected needs none
+    # a direction against the convention is a note, an expected one needs none
     off = degrees_between(turn @ Z, Z)
     assert bool(found.problems) == (off > 40)
     assert found.off_convention == pytest.approx(off, abs=1)

@@ -89,7 +89,7 @@ def test_with_nothing_to_see_the_prior_stays() -> None:
 
 
 def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]) -> None:
-    """Both session frames are tilted, one of them by six degrees; the truth says how they lie to
+    """Both session frames are tilted, one of them by six degrees; the truth has how they lie to
     each other.
     """
     truth = json.loads(shared("logs/basement_truth.json").read_text())

@@ -185,7 +185,7 @@ COARSE = {  # few keyframes, near points, few queries
 
 
 def coarse_settings(**changes: str) -> Resolved:
-    """Settings for tests of what is done again; ``changes`` as above."""
+    """Settings for tests of repeated work; ``changes`` as above."""
     return quick_settings(
         **{key.replace(".", "__"): value for key, value in COARSE.items()} | changes
     )

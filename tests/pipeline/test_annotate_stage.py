@@ -447,7 +447,7 @@ def test_annotating_under_another_name_takes_the_closures_of_that_session(
 def test_another_log_of_the_same_name_is_refused(
     labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
 ) -> None:
-    """Its closures would be those of another drive."""
+    """Its closures would belong to another drive."""
     log = tmp_path / "monday.mcap"
     log.write_bytes(drives["wednesday"].log.read_bytes())
     annotation = Annotation(AnnotationMode("copy"), tmp_path / "out.mcap")

@@ -1,5 +1,5 @@
-"""A log whose odometry starts again: `fuse` says so, `close` gives the session no closures, and
-`inspect --check` says it of the log alone.
+"""A log whose odometry starts again: `fuse` tells it, `close` gives the session no closures, and
+`inspect --check` tells it of the log alone.
 """
 
 from __future__ import annotations

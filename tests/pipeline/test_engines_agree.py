@@ -14,7 +14,7 @@ from semloc_logs.workspace import Workspace
 def test_tables_of_serial_and_processes_are_byte_identical(
     jobs: int, tools: SimpleNamespace, drives: Any, coarse: Workspace, tmp_path: Path
 ) -> None:
-    """Both drives are fused and described, and each of them asks: two tasks in every stage.
+    """Both drives are fused and described, and each of them is a query: two tasks in every stage.
     ``coarse`` was made serially.
     """
     expected = tools.files(coarse.path)

@@ -389,7 +389,7 @@ def test_an_interrupted_session_is_done_again(
     tools.renames(monkeypatch, fuse, round(share * (steps - 1)))
     assert tools.files(folder.path) == second
     assert [p.name for p in folder.path.parent.iterdir() if p.name.startswith(".")] == []
-    assert was_done(fuse()), "what was interrupted"
+    assert was_done(fuse()), "the interrupted stage"
     assert tools.files(folder.path) == {n: d for n, d in first.items() if not n.startswith("words")}
 
 
@@ -449,7 +449,7 @@ def test_settings_of_reading_stay_with_their_session(
         return str(content["settings"]["logs"]["up"])
 
     assert was_done(fuse(settings=tools.coarse_settings(logs__up="+z")))
-    assert not was_done(fuse())  # nothing is said of reading: as before
+    assert not was_done(fuse())  # no settings of reading: as before
     assert recorded() == "+z"
     assert was_done(fuse(settings=tools.coarse_settings(logs__up="0,0,2")))
     assert recorded() == "0,0,2"

@@ -281,7 +281,7 @@ def test_the_encoder_turns_with_its_input() -> None:
             )
             expected = quarter_turns(descriptors(as_it_lies).numpy(), turns)
             np.testing.assert_allclose(descriptors(turned).numpy(), expected, atol=1e-5)
-            # a turn is no identity
+            # a turn is not the identity
             assert np.abs(descriptors(as_it_lies).numpy() - expected).max() > 0.01
 
 

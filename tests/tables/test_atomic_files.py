@@ -197,7 +197,7 @@ def new_parents(folder: Path) -> None:
 FILE = {"target": b"old" * 700}
 FOLDER = {"target": OLD}
 FRESH: Tree = {}
-# writer, what was there, what is to be there, the number of syncs
+# writer, the content before and after, the number of syncs
 WRITERS: dict[str, tuple[Callable[[Path], None], Tree, Tree, int]] = {
     "file": (new_file, FRESH, {"target": b"new" * 900}, 2),
     "file again": (new_file, FILE, {"target": b"new" * 900}, 2),

@@ -1,4 +1,4 @@
-"""Learning on tiny shards: what is trained, held out, resumed and written on the card."""
+"""Learning on tiny shards: training, held-out scores, resuming, and the model card."""
 
 import json
 from collections.abc import Iterator

@@ -348,7 +348,7 @@ def test_rays_that_graze_the_ground_do_not_carve_it() -> None:
         return float((blocks.log_odds.reshape(-1)[hit] <= 0).mean())
 
     assert lost(0) == 0.0
-    assert lost(2) > 0.1  # nothing says that a building's surface is level
+    assert lost(2) > 0.1  # a building's surface need not be level
 
 
 def test_maps_that_share_a_carved_frame_are_those_that_carve_it_themselves() -> None:

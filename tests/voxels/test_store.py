@@ -94,7 +94,7 @@ def test_keyframes_come_back_to_the_grid_of_2_mm_each_in_its_row_group(tmp_path:
         np.testing.assert_array_equal(found.label, frame.label)
         assert found.points.shape == frame.points.shape
         np.testing.assert_allclose(found.points, frame.points, atol=1 / 1024 + 1e-6)
-        # what is passed on is what is read back
+        # the result equals the stored keyframe
         np.testing.assert_array_equal(found.points, kept.points)
         again = tmp_path / "again"
         again.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Segments of the index: what is found is what a fresh index finds, whatever was added, removed,
+"""Segments of the index: they find the words that a fresh index finds, whatever was added, removed,
 merged, damaged or done at once.
 """
 

@@ -189,7 +189,7 @@ def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
     for name in ("0", "180", "season"):
         asked = street.queries[name][0]
         true = asked.common_T_map
-        # what is left of the heading is at most half a step of 20 degrees
+        # the rest of the heading is at most half a step of 20 degrees
         assert abs(np.degrees(np.arctan2(true[1, 0], true[0, 0]))) <= 10
         occupied = np.argwhere(asked.state < 20) + asked.low + 0.5
         level = occupied[:, 2] * V

@@ -11,7 +11,7 @@ from semloc_logs.words.vocabulary import train_vocabulary
 
 
 def streets(radius: float = 1.5) -> module.Streets:
-    """600 words of three streets, far from each other; every third is asked for a metre away."""
+    """600 words of three streets, far from each other; every third is searched for a metre away."""
     d = draw(1, 600)
     centre = np.stack([3.0 * np.arange(600), np.zeros(600), np.zeros(600)], 1)
     asked = d[::3] + 0.05 * draw(2, 200)

@@ -583,8 +583,8 @@ def test_of_none() -> None:
 
 
 def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
-    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with
-    each and that do not, near it and far from it (4, n).
+    """For each of the ``probabilities`` (n,) the sums over other queries' alignments, agreeing
+    ones and others, near it and far from it (4, n).
 
     Of each query the most probable alignment of either kind counts, and as opposing only if it is
     more probable than an agreeing one.

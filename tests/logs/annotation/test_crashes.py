@@ -130,7 +130,7 @@ def mended(state: Tree, folder: Path) -> Tree | str:
     """What the next look at the log makes of a state; the sentence of the error if it refuses."""
     log = write_tree(state, folder) / "log.mcap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda handle: None)  # only what is in memory counts here
+        patch.setattr(os, "fsync", lambda handle: None)  # only the content of memory counts here
         patch.setattr(atomic_files, "_PROCESS", "later")  # the writer is dead, this is another
         try:
             recover(log)

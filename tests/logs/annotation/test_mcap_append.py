@@ -1,4 +1,4 @@
-"""Adding records to MCAP files of every shape; what was recorded survives."""
+"""Adding records to MCAP files of every shape; the recorded messages survive."""
 
 from __future__ import annotations
 

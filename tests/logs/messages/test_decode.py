@@ -441,7 +441,7 @@ module geometry_msgs { module msg { struct PoseStamped {
 @pytest.mark.parametrize(
     ("encoding", "text"),
     [
-        ("ros2msg", b"this is no definition ["),
+        ("ros2msg", b"this is not a definition ["),
         ("ros2msg", b"foo_msgs/Missing header"),
         ("ros2msg", b"std_msgs/Header[1000000000] header"),
         ("ros2msg", b"string[1000000000] header"),

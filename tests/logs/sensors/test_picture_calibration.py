@@ -136,7 +136,7 @@ def test_only_one_of_the_two_fits_the_picture() -> None:
     fitted, assumption = fitted_camera(both, 240, 400)
     assert four(fitted) == [500, 400, 222, 36]
     assert "only the region is applied" in assumption
-    # the region is where the picture is valid, not what is left of it
+    # the region is where the picture is valid, not its remainder
     fitted, assumption = fitted_camera(camera(roi=Region(10, 10, 600, 400)), 480, 640)
     assert four(fitted) == [500, 400, 322, 236]
     assert assumption == ""

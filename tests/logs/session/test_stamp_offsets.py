@@ -260,7 +260,7 @@ def test_header_stamps_of_zero_are_kept_where_the_user_wants_them(recorder: Reco
 
 
 def test_a_single_zero_among_good_stamps_is_not_replaced(recorder: Recorder) -> None:
-    """A time that is a latency off would put the pose, and what is interpolated, elsewhere."""
+    """A time that is a latency off would put the pose, and interpolated ones, elsewhere."""
     log = recorder()
     for k in range(60):
         log.cloud("/points", EPOCH + k * 100 * MS, "base_link", np.ones(3, POINT))

@@ -230,7 +230,7 @@ def test_a_bare_tree_has_the_same_trunk_and_less_crown(kind: str) -> None:
         second = np.random.default_rng(seed)
         summer = objects.tree(first, 1.0, kind)
         winter = objects.tree(second, 1.0, kind, bare=True)
-        assert first.random() == second.random()  # so that what is drawn afterwards is the same too
+        assert first.random() == second.random()  # later draws are the same, too
         if SPECIES[kind].evergreen:
             assert same(summer, winter)
             continue
