@@ -7,19 +7,23 @@ import io
 import shutil
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.annotation import mcap_append
 from semloc_logs.logs.annotation.annotate import (
     ClosureRecord,
     Results,
@@ -27,7 +31,9 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_in_place,
     content_fingerprint,
 )
-from semloc_logs.logs.annotation.mcap_append import read_end
+from semloc_logs.logs.annotation.channels import NewChannel, NewMessage
+from semloc_logs.logs.annotation.mcap_append import empty_end, plan_append, read_end
+from semloc_logs.logs.containers.mcap_records import raw
 from semloc_logs.logs.containers.open import open_log
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
@@ -327,6 +333,115 @@ def test_records_behind_ours_are_not_lost(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be replaced"):
         annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     assert log.read_bytes() == changed
+
+
+CHANNEL = NewChannel("/semloc/x", "json", "thing", "jsonschema", b"{}", {})
+
+
+def test_a_channel_without_messages_is_not_added() -> None:
+    start, end = empty_end("", "test")
+    added = io.BytesIO(start + plan_append(end, [CHANNEL], [], "semloc/x", {}).new_tail)
+    summary = make_reader(added, validate_crcs=True).get_summary()
+    assert summary is not None
+    assert (summary.channels, summary.schemas, summary.chunk_indexes) == ({}, {}, [])
+    assert len(summary.metadata_indexes) == 1
+
+
+def test_an_empty_log_has_the_times_of_its_results() -> None:
+    start, end = empty_end("", "test")
+    messages = [NewMessage(0, 5, b"{}"), NewMessage(0, 9, b"{}")]
+    added = start + plan_append(end, [CHANNEL], messages, "semloc/x", {}).new_tail
+    summary = make_reader(io.BytesIO(added), validate_crcs=True).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_start_time == 5
+    assert summary.statistics.message_end_time == 9
+
+
+def test_every_index_leads_to_its_message(tmp_path: Path) -> None:
+    """From a chunk index to the message index of each channel, from there into the chunk."""
+    log = tmp_path / "log.mcap"
+    write_log(log)
+    annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+    data = log.read_bytes()
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary is not None
+    ours = summary.chunk_indexes[-1]
+    # opcode, length, times, size, CRC, compression "zstd", size of the data
+    packed = data[ours.chunk_start_offset + 9 + 28 + 8 + 8 :][: ours.compressed_size]
+    chunk = zstandard.decompress(packed, ours.uncompressed_size)
+    assert chunk[0] == Opcode.SCHEMA
+    begin = ours.chunk_start_offset + 9 + 16
+    assert data[begin : begin + 12] == struct.pack("<QI", len(chunk), zlib.crc32(chunk))
+
+    count = 0
+    for channel, offset in ours.message_index_offsets.items():
+        opcode, _, own_id, size = struct.unpack("<BQHI", data[offset : offset + 15])
+        assert (opcode, own_id) == (Opcode.MESSAGE_INDEX, channel)
+        for time, place in struct.iter_unpack("<QQ", data[offset + 15 : offset + 15 + size]):
+            record = struct.unpack("<BQHIQ", chunk[place : place + 23])
+            assert (record[0], record[2], record[4]) == (Opcode.MESSAGE, channel, time)
+            count += 1
+    assert count == 6  # two closures, two poses, two markers
+
+
+def test_ids_of_channels_are_used_up_to_the_last() -> None:
+    """Ids have 16 bits: behind channel 65534 there is room for one, behind 65535 for none."""
+    _, end = empty_end("", "test")
+    messages = [NewMessage(0, 5, b"{}")]
+    last = {Opcode.CHANNEL: [raw(Channel(65534, "/old", "json", {}, 0))]}
+    new = plan_append(
+        replace(end, summary=replace(end.summary, groups=last)), [CHANNEL], messages, "x", {}
+    )
+    assert raw(Channel(65535, "/semloc/x", "json", {}, 1)) in new.new_tail
+    full = {Opcode.CHANNEL: [raw(Channel(65535, "/old", "json", {}, 0))]}
+    with pytest.raises(LogError, match="no free schema or channel ids left"):
+        plan_append(
+            replace(end, summary=replace(end.summary, groups=full)), [CHANNEL], messages, "x", {}
+        )
+
+
+def test_a_damaged_summary_is_refused(tmp_path: Path) -> None:
+    """A letter of a topic in the summary changes: only the checksum tells it."""
+    log = tmp_path / "log.mcap"
+    write_log(log)
+    data = bytearray(log.read_bytes())
+    data[data.rindex(b"/two") + 1] ^= 1
+    log.write_bytes(data)
+    with pytest.raises(LogError, match=rf"damaged summary \(checksum at offset {len(data) - 12}\)"):
+        annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+    data[-12:-8] = bytes(4)  # a file without a checksum
+    log.write_bytes(data)
+    assert [c.topic for c in read_end(io.BytesIO(data), log).channels] == ["/one", "/uwo"]
+
+
+def test_a_summary_that_repeats_a_channel_is_not_scanned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "log.mcap"
+    write_log(log)
+    data = log.read_bytes()
+    first = data.rindex(b"/one") - 17  # opcode, length, id, schema, length of the topic
+    length = 9 + int.from_bytes(data[first + 1 : first + 9], "little")
+    assert data[first] == Opcode.CHANNEL
+    twice = data[:first] + data[first : first + length] + data[first:]
+    summary_start = struct.unpack("<Q", data[-28:-20])[0]
+    footer = struct.pack("<BQQQI", Opcode.FOOTER, 20, summary_start, 0, 0)
+    monkeypatch.setattr(mcap_append, "scan", None)
+    end = read_end(io.BytesIO(twice[:-37] + footer + data[-8:]), log)
+    assert sorted(c.topic for c in end.channels) == ["/one", "/one", "/two"]
+
+
+def test_results_that_were_changed_are_not_ours(tmp_path: Path) -> None:
+    """A byte of our chunk is changed: it may hold something else by now, and is kept."""
+    log = tmp_path / "log.mcap"
+    write_log(log)
+    start = len(data_section(log)[0])
+    annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+    data = bytearray(log.read_bytes())
+    data[start + 80] ^= 1
+    with pytest.raises(LogError, match="cannot be replaced"):
+        read_end(io.BytesIO(data), log)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 20, 300, -1, -9, -50])
