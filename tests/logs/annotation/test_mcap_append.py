@@ -444,6 +444,19 @@ def test_results_that_were_changed_are_not_ours(tmp_path: Path) -> None:
         read_end(io.BytesIO(data), log)
 
 
+def test_a_metadata_record_larger_than_ours_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its length comes from the file: it may be anything."""
+    log = tmp_path / "log.mcap"
+    write_log(log)
+    annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+    assert read_end(log.open("rb"), log).replaces
+    monkeypatch.setattr(mcap_append, "MAX_METADATA", 100)
+    with pytest.raises(LogError, match="cannot be replaced"):
+        read_end(log.open("rb"), log)
+
+
 @pytest.mark.parametrize("keep", [0, 5, 20, 300, -1, -9, -50])
 def test_cut_off_logs_are_refused_and_nothing_is_written(tmp_path: Path, keep: int) -> None:
     log = tmp_path / "log.mcap"
