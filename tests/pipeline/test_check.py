@@ -87,6 +87,7 @@ def test_inspect_checks_a_log_alone(reset_log: Path, drives: dict[str, Any]) -> 
     assert run.exit_code == 3
     assert content["verdict"].startswith("not to be trusted: /odometry: the poses start again")
     assert content["suggested"] == ""
+    assert any("start again at the identity" in sentence for sentence in content["skipped"])
     assert content["fit"]["fits"] is False
 
     run = CliRunner().invoke(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -29,6 +31,17 @@ def without_a_column(path: Path) -> None:
 def without_a_row(path: Path) -> None:
     table = pq.read_table(path, partitioning=None)
     pq.write_table(table.slice(1), path)
+
+
+def with_another_type(path: Path) -> None:
+    table = pq.read_table(path, partitioning=None)
+    pq.write_table(table.set_column(0, table.column_names[0], table[0].cast(pa.string())), path)
+
+
+def of_another_decision(path: Path) -> None:
+    table = pq.read_table(path, partitioning=None)
+    metadata = json.loads(table.schema.metadata[b"semloc"]) | {"fingerprint": "0" * 16}
+    pq.write_table(table.replace_schema_metadata({"semloc": json.dumps(metadata)}), path)
 
 
 def of_another_map(path: Path) -> None:
@@ -63,6 +76,12 @@ def test_a_whole_workspace_has_no_faults(coarse: Workspace) -> None:
             "column stamp_ns",
             "fuse .*monday",
         ),
+        (
+            MONDAY + "trajectory.parquet",
+            with_another_type,
+            "column stamp_ns is not there as int64",
+            "fuse .*monday",
+        ),
         (MONDAY + "frames.parquet", without_a_row, "rows are there of", "fuse .*monday.*"),
         (MONDAY + "session.json", cut_off, "cannot be read", "fuse LOG"),
         (MONDAY + "words.json", of_another_map, "of another map", "describe monday"),
@@ -87,6 +106,7 @@ def test_a_whole_workspace_has_no_faults(coarse: Workspace) -> None:
         ("workspace.json", without_settings, "of another version", "rm .*workspace.json$"),
         ("closures.parquet", cut_off, "cannot be read", "semloc close .* --overwrite"),
         ("rejected.parquet", Path.unlink, "is missing", "semloc close .* --overwrite"),
+        ("closures.parquet", of_another_decision, "was not decided from", "semloc close -w"),
     ],
 )
 def test_damage_is_named_with_what_mends_it(
@@ -110,3 +130,14 @@ def test_other_settings_and_sessions_that_are_gone_are_named(coarse: Workspace) 
     write_json(coarse.settings, content)
     faults = {f.fault for f in examine(coarse).findings}
     assert any("monday was fused with fusion.hit=0.85" in fault for fault in faults)
+
+
+def test_failed_logs_and_searches_that_were_not_ended_are_named(coarse: Workspace) -> None:
+    write_json(coarse.failure("friday"), {"reason": "friday.bag is cut off.", "fingerprint": ""})
+    part = coarse.search_parts("tuesday")
+    part.mkdir(parents=True)
+    failed, interrupted = examine(coarse).findings
+    assert (failed.path, failed.fault) == (coarse.failure("friday"), "friday.bag is cut off.")
+    assert failed.remedy.endswith("--retry-failed")
+    assert (interrupted.path, interrupted.fault) == (part, "a search was interrupted")
+    assert interrupted.remedy == f"semloc close -w {coarse.path}"

@@ -70,6 +70,10 @@ def test_one_session_in_a_room_is_enough(fused: Callable[..., Workspace]) -> Non
     assert hints.voxel_size_hint(fused()) is None
 
 
+def test_the_smallest_room_is_named(fused: Callable[..., Workspace]) -> None:
+    assert "of a " in str(hints.voxel_size_hint(fused(a=(4.0, 0.3), b=(9.0, 0.3))))
+
+
 def test_closures_that_were_not_searched_yet(fused: Callable[..., Workspace]) -> None:
     work = fused(a=(4.0, 0.3))
     with pytest.raises(WorkspaceError, match="has no closures yet: run 'semloc close' first"):
