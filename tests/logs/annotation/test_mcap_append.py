@@ -389,12 +389,12 @@ def test_ids_of_channels_are_used_up_to_the_last() -> None:
     """Ids have 16 bits: behind channel 65534 there is room for one, behind 65535 for none."""
     _, end = empty_end("", "test")
     messages = [NewMessage(0, 5, b"{}")]
-    last = {Opcode.CHANNEL: [raw(Channel(65534, "/old", "json", {}, 0))]}
+    last: dict[int, list[bytes]] = {Opcode.CHANNEL: [raw(Channel(65534, "/old", "json", {}, 0))]}
     new = plan_append(
         replace(end, summary=replace(end.summary, groups=last)), [CHANNEL], messages, "x", {}
     )
     assert raw(Channel(65535, "/semloc/x", "json", {}, 1)) in new.new_tail
-    full = {Opcode.CHANNEL: [raw(Channel(65535, "/old", "json", {}, 0))]}
+    full: dict[int, list[bytes]] = {Opcode.CHANNEL: [raw(Channel(65535, "/old", "json", {}, 0))]}
     with pytest.raises(LogError, match="no free schema or channel ids left"):
         plan_append(
             replace(end, summary=replace(end.summary, groups=full)), [CHANNEL], messages, "x", {}
