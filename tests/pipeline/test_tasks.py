@@ -15,8 +15,10 @@ from click.testing import CliRunner, Result
 from semloc_logs.cli.main import program
 from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.engines import Serial
-from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.errors import LogError, SettingsError, WorkspaceError
+from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.tasks import Stage, do_task, list_tasks, parse_task
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 TWO = ("monday", "tuesday")
@@ -187,3 +189,56 @@ def test_parts_of_a_killed_task_are_used(
     do_task(SEARCHES[1], [], coarse, settings, Serial())
     assert not parts.exists()
     assert table.read_bytes() == undisturbed
+
+
+def test_a_task_fuses_its_session_only(drives: Any, tools: SimpleNamespace, tmp_path: Path) -> None:
+    work = Workspace(tmp_path / "work")
+    sessions = tools.inputs(drives, *TWO)
+    report = do_task("fuse/monday", sessions, work, tools.coarse_settings(), Serial())
+    assert report.done == ["monday"]
+    assert [folder.name for folder in work.sessions()] == ["monday"]
+    with pytest.raises(SettingsError, match=r"None of the logs .* Did you mean 'monday'\?"):
+        do_task("fuse/mondey", sessions, work, tools.coarse_settings(), Serial())
+
+
+def test_a_task_reads_a_failed_log_again_when_told_so(
+    tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    work = Workspace(tmp_path / "work")
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"not a log")
+    sessions = [SessionInput("bad", (bad,))]
+    written = []
+    settings = tools.coarse_settings()
+    for again in (False, False, True):
+        with pytest.raises(LogError, match=r"bad\.mcap is not a log"):
+            do_task("fuse/bad", sessions, work, settings, Serial(), retry_failed=again)
+        written.append(work.failure("bad").stat().st_mtime_ns)
+    assert written[0] == written[1] < written[2]
+    [task] = list_tasks(Stage.FUSE, sessions, work, settings)
+    assert not task.done
+
+
+def test_a_search_tells_whether_it_was_done(coarse: Workspace, tools: SimpleNamespace) -> None:
+    coarse.alignments("tuesday", "monday").unlink()
+    coarse.settings.unlink()  # a task may be the first of a workspace with these settings
+    settings = tools.coarse_settings()
+    first = do_task(SEARCHES[1], [], coarse, settings, Serial())
+    assert (first.done, first.kept, first.skipped) == ([SEARCHES[1]], [], [])
+    assert coarse.settings.exists()
+    again = do_task(SEARCHES[1], [], coarse, settings, Serial())
+    assert (again.done, again.kept) == ([], [SEARCHES[1]])
+
+
+def test_a_session_whose_poses_do_not_fit_is_not_searched(
+    coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    path = coarse.session("monday").session_json
+    content = read_json(path)
+    write_json(path, content | {"fit": {"track": "its poses jump", "streams": []}})
+    settings = tools.coarse_settings()
+    listed = [task.id for task in list_tasks(Stage.SEARCH, [], coarse, settings)]
+    assert listed == [SEARCHES[2]]
+    report = do_task(SEARCHES[1], [], coarse, settings, Serial())
+    [sentence] = report.skipped
+    assert "Session monday gets no closures: its poses do not fit (its poses jump)" in sentence
