@@ -2,7 +2,6 @@
 beside the checkout.
 """
 
-import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -40,16 +39,7 @@ def shared() -> Callable[[str], Path]:
     return find
 
 
-def _load_helper(name: str) -> None:
-    """Make ``tests/NAME.py`` importable as ``tests.NAME``; the tests have no package."""
-    spec = importlib.util.spec_from_file_location(f"tests.{name}", ROOT / "tests" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules.setdefault("tests", ModuleType("tests"))
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-
-
-_load_helper("lossy_disk")
-_load_helper("servers")
+# helpers such as tests/lossy_disk.py are imported as tests.lossy_disk; the tests have no package
+tests = ModuleType("tests")
+tests.__path__ = [str(ROOT / "tests")]
+sys.modules.setdefault("tests", tests)
