@@ -191,10 +191,10 @@ def _turned(T: F64, spread: F64, ray: F64) -> None:
 def _add_hold(H: F64, g: F64, T: F64, start: F64, query_centre: F64, hold: float) -> None:
     """Add to the normal equations what holds the query's centre where it started."""
     for k in range(3):
-        off = start[k, 3] - T[k, 3]
+        moved = start[k, 3] - T[k, 3]
         for m in range(3):
-            off += (start[k, m] - T[k, m]) * query_centre[m]
-        g[k] -= hold * off
+            moved += (start[k, m] - T[k, m]) * query_centre[m]
+        g[k] -= hold * moved
         H[k, k] += hold
 
 

@@ -181,10 +181,10 @@ def _flattened(
         covariance(moments, mean, a)
         principal_axes(a, extent, axes)
         longest = extent[2] + LEAST_SPREAD
-        off = mean[0] * axes[0, 0] + mean[1] * axes[1, 0] + mean[2] * axes[2, 0]
+        height = mean[0] * axes[0, 0] + mean[1] * axes[1, 0] + mean[2] * axes[2, 0]
         for k in range(3):
             normals[n, k] = axes[k, 0]
-            moved[n, k] += off * axes[k, 0]
+            moved[n, k] += height * axes[k, 0]
         is_thin = extent[0] / longest < THICK
         planar[n] = 1.0 if is_thin and (longest - extent[1]) / longest < LINEAR else 0.0
     return moved, normals, planar

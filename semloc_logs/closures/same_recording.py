@@ -43,11 +43,13 @@ def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
 
 def _shared(session: SessionMap, other: SessionMap) -> int:
     """How many keyframes of both have one stamp, and points with the same mean."""
-    _, mine, its = np.intersect1d(session.stamps_ns, other.stamps_ns, return_indices=True)
-    if not len(mine):
+    _, own_rows, other_rows = np.intersect1d(
+        session.stamps_ns, other.stamps_ns, return_indices=True
+    )
+    if not len(own_rows):
         return 0
     means = session.view_means()
     other_means = other.view_means()
     if not means or not other_means:
         return 0
-    return sum(means[i] == other_means[k] for i, k in zip(mine, its, strict=True))
+    return sum(means[i] == other_means[k] for i, k in zip(own_rows, other_rows, strict=True))

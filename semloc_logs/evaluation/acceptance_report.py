@@ -161,10 +161,10 @@ def report_of(judged: Judged, p: F64) -> AcceptanceReport:
     ordinary = judged.clear & ~judged.copies
     groups = []
     for kind in sorted(set(kinds)):
-        mine = kinds == kind
-        pairs = sorted(set(sensors[mine]))
+        of_kind = kinds == kind
+        pairs = sorted(set(sensors[of_kind]))
         for name in pairs if len(pairs) == 1 else [ALL, *pairs]:
-            rows = mine if name == ALL else mine & (sensors == name)
+            rows = of_kind if name == ALL else of_kind & (sensors == name)
             groups.append(_group(judged.part(rows), p[rows], kind, name))
     return AcceptanceReport(
         len({key[:3] for key in _query_keys(judged)}),
@@ -188,14 +188,14 @@ def kinds_of(judged: Judged) -> NDArray[np.object_]:
     out = np.full(len(judged), "", object)
     copied = judged.copies
     for town in set(judged.town):
-        mine = judged.town == town
+        of_town = judged.town == town
         queries = set(
-            zip(judged.placed.query_session[mine], judged.placed.query[mine], strict=True)
+            zip(judged.placed.query_session[of_town], judged.placed.query[of_town], strict=True)
         )
         sessions = {session for session, _ in queries}
         sweeps = "single sweeps" if len(queries) == len(sessions) else "drives"
-        copies = "copied blocks" if copied[mine].any() else "ordinary towns"
-        out[mine] = f"{sweeps}, {copies}"
+        copies = "copied blocks" if copied[of_town].any() else "ordinary towns"
+        out[of_town] = f"{sweeps}, {copies}"
     return out
 
 

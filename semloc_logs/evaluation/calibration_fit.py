@@ -137,13 +137,13 @@ def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
 def agreement_of(judged: Judged, own: F64) -> Agreement[F64]:
     """The agreement (n,) within each town of alignments with log-odds ``own`` (n,)."""
     out = Agreement(*np.zeros((7, len(judged))))
-    for mine in _towns(judged):
-        placed = replace(judged.placed.part(mine), log_odds=own[mine])
+    for of_town in _towns(judged):
+        placed = replace(judged.placed.part(of_town), log_odds=own[of_town])
         pairs = pairs_of(placed)
         own_odds = place_odds(placed, pairs, placed.log_odds, judged.voxel_size)
         votes = count_votes(placed, pairs, own_odds.share, judged.voxel_size)
         for name in (f.name for f in fields(Agreement)):
-            getattr(out, name)[mine] = getattr(votes, name)
+            getattr(out, name)[of_town] = getattr(votes, name)
     return out
 
 
@@ -153,10 +153,10 @@ def _towns(judged: Judged) -> list[NDArray[np.int64]]:
 
 def _held_out(judged: Judged) -> Iterator[tuple[NDArray[np.int64], Bools]]:
     """The rows of each town, and which (n,) are of the others."""
-    for mine in _towns(judged):
+    for of_town in _towns(judged):
         others = np.ones(len(judged), bool)
-        others[mine] = False
-        yield mine, others
+        others[of_town] = False
+        yield of_town, others
 
 
 def decided_by(model: Model, judged: Judged) -> F64:
@@ -170,13 +170,13 @@ def decided_by(model: Model, judged: Judged) -> F64:
 def probability(judged: Judged, own: F64, with_votes: F64) -> F64:
     """The product of the factors (n,), of log-odds ``own`` and ``with_votes`` (n,)."""
     out = position_confidence(judged.placed.sigma, judged.voxel_size)
-    for mine in _towns(judged):
-        placed = judged.placed.part(mine)
+    for of_town in _towns(judged):
+        placed = judged.placed.part(of_town)
         pairs = pairs_of(placed)
-        out[mine] *= place_odds(
-            placed, pairs, with_votes[mine], judged.voxel_size
+        out[of_town] *= place_odds(
+            placed, pairs, with_votes[of_town], judged.voxel_size
         ).place_probability
-        out[mine] *= place_odds(placed, pairs, own[mine], judged.voxel_size).mode_share
+        out[of_town] *= place_odds(placed, pairs, own[of_town], judged.voxel_size).mode_share
     return out
 
 
@@ -207,9 +207,9 @@ def fit(judged: Judged) -> Fitted:
     """
     kept = possible(judged)
     own = np.zeros(len(judged))
-    for mine, others in _held_out(judged):
-        unseen = Evidence.of(judged.features.part(mine)).vector()
-        own[mine] = fit_alone(judged, others & kept).log_odds(unseen)
+    for of_town, others in _held_out(judged):
+        unseen = Evidence.of(judged.features.part(of_town)).vector()
+        own[of_town] = fit_alone(judged, others & kept).log_odds(unseen)
     whole = fit_alone(judged, kept)
     scale, shift = _temper(own, judged, kept)
     most = float(np.log(judged.clear.sum()))
@@ -220,9 +220,9 @@ def fit(judged: Judged) -> Fitted:
 
     agreement = agreement_of(judged, own)
     total = np.zeros(len(judged))
-    for mine, others in _held_out(judged):
+    for of_town, others in _held_out(judged):
         votes = fit_votes(judged, agreement, others & kept, own)
-        total[mine] = own[mine] + votes.log_odds(Votes.of(agreement.part(mine)).vector())
+        total[of_town] = own[of_town] + votes.log_odds(Votes.of(agreement.part(of_town)).vector())
     total = np.minimum(total, most)
     p = np.where(kept, probability(judged, own, total), 0.0)
     most_alike = max_ambiguity(judged, agreement, np.where(kept, probability_of(total), 0.0))

@@ -25,5 +25,5 @@ def in_window(
     one_deg: F64 | float, other_deg: F64 | float, heading_deg: float
 ) -> NDArray[np.bool_]:
     """Whether two headings differ by ``heading_deg`` +- ``WINDOW_DEG``."""
-    off = np.abs(heading_difference(one_deg, other_deg) - heading_deg)
-    return np.asarray(off <= WINDOW_DEG + 1e-9)
+    difference = np.abs(heading_difference(one_deg, other_deg) - heading_deg)
+    return np.asarray(difference <= WINDOW_DEG + 1e-9)

@@ -94,12 +94,12 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
     n = len(rows)
     road, target_road = np.zeros((2, n))
     own, at = np.zeros((2, n, 4, 4))
-    for (query, target), mine in rows.by_pair():
-        ends = (rows.query_keyframe[mine], rows.target_keyframe[mine])
-        road[mine] = maps[query].distance[ends[0]]
-        target_road[mine] = maps[target].distance[ends[1]]
-        own[mine] = maps[query].map_T_base[ends[0]]
-        at[mine] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[mine]
+    for (query, target), of_pair in rows.by_pair():
+        ends = (rows.query_keyframe[of_pair], rows.target_keyframe[of_pair])
+        road[of_pair] = maps[query].distance[ends[0]]
+        target_road[of_pair] = maps[target].distance[ends[1]]
+        own[of_pair] = maps[query].map_T_base[ends[0]]
+        at[of_pair] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[of_pair]
     query_session, target_session = rows.sessions()
     columns: dict[str, Any] = {
         "query_session": query_session.tolist(),
@@ -127,26 +127,26 @@ def _errors(rows: Alignments, tracks: Mapping[str, TrueTrack]) -> dict[str, pa.A
     """
     n = len(rows)
     known = np.zeros(n, bool)
-    off = np.zeros((n, 6))  # in the target's axes, as the covariance is
-    for (query, target), mine in rows.by_pair():
+    error = np.zeros((n, 6))  # in the target's axes, as the covariance is
+    for (query, target), of_pair in rows.by_pair():
         if query not in tracks or target not in tracks:
             continue
-        query_pose, query_known = tracks[query].at(rows.query_stamp_ns[mine])
-        target_pose, target_known = tracks[target].at(rows.target_stamp_ns[mine])
-        known[mine] = query_known & target_known
+        query_pose, query_known = tracks[query].at(rows.query_stamp_ns[of_pair])
+        target_pose, target_known = tracks[target].at(rows.target_stamp_ns[of_pair])
+        known[of_pair] = query_known & target_known
         true = inverse(target_pose) @ query_pose
-        found = rows.target_T_query[mine]
-        off[mine, :3] = found[:, :3, 3] - true[:, :3, 3]
+        found = rows.target_T_query[of_pair]
+        error[of_pair, :3] = found[:, :3, 3] - true[:, :3, 3]
         turned = found[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)
-        off[mine, 3:] = Rotation.from_matrix(turned).as_rotvec()
+        error[of_pair, 3:] = Rotation.from_matrix(turned).as_rotvec()
 
-    error_m = np.linalg.norm(off[:, :3], axis=1)
-    error_deg = np.degrees(np.linalg.norm(off[:, 3:], axis=1))
+    error_m = np.linalg.norm(error[:, :3], axis=1)
+    error_deg = np.degrees(np.linalg.norm(error[:, 3:], axis=1))
     values = {
         "error_m": error_m,
         "error_deg": error_deg,
-        "nees_position": normalised_squares(off[:, :3], rows.covariance[:, :3, :3]),
-        "nees_pose": normalised_squares(off, rows.covariance),
+        "nees_position": normalised_squares(error[:, :3], rows.covariance[:, :3, :3]),
+        "nees_pose": normalised_squares(error, rows.covariance),
         "right": (error_m <= CORRECT_M) & (error_deg <= CORRECT_DEG),
     }
     return {name: pa.array(value, mask=~known) for name, value in values.items()}

@@ -337,8 +337,8 @@ def _count_queries(
     right = _correct_ends(sessions, rows)
     counts = _Counts()
     for name in revisits.trees:
-        mine = sessions[name]
-        for k in query_keyframes(mine, settings):
+        session = sessions[name]
+        for k in query_keyframes(session, settings):
             if not known[name][k]:
                 continue
             counts.queries += 1
@@ -347,7 +347,7 @@ def _count_queries(
                 for other in revisits.trees
                 if other != name and revisits.is_near(name, k, other)
             ]
-            if self_closures and _revisits_itself(mine, revisits, name, k, settings.closures):
+            if self_closures and _revisits_itself(session, revisits, name, k, settings.closures):
                 near.append(name)
             if not near:
                 continue

@@ -215,11 +215,11 @@ def _serving(found: Sequence[Segment], words: Mapping[str, SessionWords]) -> Ser
     taken: set[str] = set()
     out: Serving = {}
     for segment in found:
-        mine = {
+        served = {
             h.name for h in segment.sessions if h.name in words and words[h.name].key == h.key
         } - taken
-        taken |= mine
-        out[segment] = frozenset(mine)
+        taken |= served
+        out[segment] = frozenset(served)
     return out
 
 

@@ -77,13 +77,13 @@ class Streets:
         possible = np.flatnonzero(cKDTree(self.centre).query(self.query_centre)[0] < self.radius)
         if not len(possible):
             raise SettingsError("None of the query words has a true one among the streets' words.")
-        mine = np.sort(np.random.default_rng(1).permutation(possible)[:QUERIES])
+        chosen = np.sort(np.random.default_rng(1).permutation(possible)[:QUERIES])
         return Streets(
             self.centre,
             self.descriptor,
             self.street,
-            self.query_centre[mine],
-            self.query[mine],
+            self.query_centre[chosen],
+            self.query[chosen],
             self.radius,
         )
 

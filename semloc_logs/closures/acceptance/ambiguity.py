@@ -62,17 +62,21 @@ def ambiguity(
     # by session: roads of all queries that can show it; where some do, and how much
     shown: dict[str, list[tuple[F64, F64, F64]]] = {}
     for (query, target), rows in pairs.items():
-        first, second, much = _second_places(placed, rows, support, voxel_size)
-        shown.setdefault(query, []).append((roads[query], placed.road[first], much))
+        first, second, weights = _second_places(placed, rows, support, voxel_size)
+        shown.setdefault(query, []).append((roads[query], placed.road[first], weights))
         if target != query:  # the target shows it too, at both places
-            both = np.concatenate([first, second[much > 0]])
+            both = np.concatenate([first, second[weights > 0]])
             shown.setdefault(target, []).append(
-                (placed.target_road[first], placed.target_road[both], np.r_[much, much[much > 0]])
+                (
+                    placed.target_road[first],
+                    placed.target_road[both],
+                    np.r_[weights, weights[weights > 0]],
+                )
             )
     contradicted = triples[~with_lone, 0]
     for session in sorted(set(placed.query_session[contradicted])):
-        mine = contradicted[placed.query_session[contradicted] == session]
-        road = np.unique(placed.road[mine])
+        of_session = contradicted[placed.query_session[contradicted] == session]
+        road = np.unique(placed.road[of_session])
         shown.setdefault(session, []).append((roads[session], road, np.ones(len(road))))
     out = np.where(lone & _among_copies(placed, known, triples[with_lone]), 1.0, 0.0)
     for sessions, end_roads in (
@@ -80,27 +84,27 @@ def ambiguity(
         (placed.target_session, placed.target_road),
     ):
         for session in sorted(set(sessions)):
-            mine = np.flatnonzero(sessions == session)
-            of_all = _about(roads.get(session, np.zeros(0)), end_roads[mine], reach)
-            for everyone, at, much in shown.get(session, []):
-                share = _about(at, end_roads[mine], reach, much) / np.maximum(
-                    np.maximum(of_all, _about(everyone, end_roads[mine], reach)), 1.0
+            of_session = np.flatnonzero(sessions == session)
+            of_all = _about(roads.get(session, np.zeros(0)), end_roads[of_session], reach)
+            for everyone, places, weights in shown.get(session, []):
+                share = _about(places, end_roads[of_session], reach, weights) / np.maximum(
+                    np.maximum(of_all, _about(everyone, end_roads[of_session], reach)), 1.0
                 )
-                out[mine] = np.maximum(out[mine], np.minimum(share, 1.0))
+                out[of_session] = np.maximum(out[of_session], np.minimum(share, 1.0))
     return out
 
 
-def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
-    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
+def _about(places: F64, road: F64, reach: float, weights: F64 | None = None) -> F64:
+    """How many of ``places`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
 
     With ``much`` (m,) the sums of how much they show.
     """
-    order = np.argsort(at, kind="stable")
-    sums = np.r_[0.0, np.cumsum(np.ones(len(at)) if much is None else much[order])]
-    at = at[order]
+    order = np.argsort(places, kind="stable")
+    sums = np.r_[0.0, np.cumsum(np.ones(len(places)) if weights is None else weights[order])]
+    places = places[order]
     return np.asarray(
-        sums[np.searchsorted(at, road + reach, "right")]
-        - sums[np.searchsorted(at, road - reach, "left")]
+        sums[np.searchsorted(places, road + reach, "right")]
+        - sums[np.searchsorted(places, road - reach, "left")]
     )
 
 
@@ -115,22 +119,24 @@ def _second_places(
     apart = APART * voxel_size / STREET_VOXEL
     contradicting = contradicts_odometry(placed.part(rows), voxel_size)
     cuts = np.flatnonzero(np.diff(placed.query[rows])) + 1
-    found = []
+    chosen = []
     for places, wrong in zip(np.split(rows, cuts), np.split(contradicting, cuts), strict=True):
-        at = placed.target_T_query[places, :3, 3]
+        position = placed.target_T_query[places, :3, 3]
         road = placed.target_road[places]
-        mine = support[places]
-        off = np.linalg.norm(at[:, None] - at, axis=2)
-        held = np.where(mine >= LEAST_SUPPORT, mine, 0.0)
-        is_second = off > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road)
+        own_support = support[places]
+        distance = np.linalg.norm(position[:, None] - position, axis=2)
+        held = np.where(own_support >= LEAST_SUPPORT, own_support, 0.0)
+        is_second = distance > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road)
         lesser = np.where(is_second, np.minimum(held[:, None], held), 0.0)
         a, b = np.unravel_index(int(np.argmax(lesser)), lesser.shape)
-        best = int(np.argmax(mine))
-        much = max(float(lesser[a, b]), float(held[wrong].max(initial=0.0)))
-        found.append(
-            (places[a], places[b], much) if lesser[a, b] > 0 else (places[best], places[best], much)
+        best = int(np.argmax(own_support))
+        weight = max(float(lesser[a, b]), float(held[wrong].max(initial=0.0)))
+        chosen.append(
+            (places[a], places[b], weight)
+            if lesser[a, b] > 0
+            else (places[best], places[best], weight)
         )
-    first, second, most = zip(*found, strict=True)
+    first, second, most = zip(*chosen, strict=True)
     return np.array(first), np.array(second), np.array(most)
 
 
@@ -167,9 +173,9 @@ def _contradictions(placed: Placed, pairs: Pairs, support: F64, voxel_size: floa
                 placed.target_T_query[x] @ inverse(placed.map_T_query[x]) @ placed.map_T_query[y]
             )
             h_T_y = placed.target_T_query[z] @ inverse(placed.map_T_query[z]) @ g_T_y
-            off = np.linalg.norm(h_T_y[:, :3, 3] - placed.target_T_query[y, :3, 3], axis=1)
+            distance = np.linalg.norm(h_T_y[:, :3, 3] - placed.target_T_query[y, :3, 3], axis=1)
             way = along[0] + along[1] + np.abs(placed.target_road[z] - placed.target_road[y])
-            wrong = (off > APART * scale + (ODOMETRY_DRIFT + ARM) * way) & (
+            wrong = (distance > APART * scale + (ODOMETRY_DRIFT + ARM) * way) & (
                 np.maximum(*along) <= FAR * scale
             )
             found.append(np.stack([x, y, z], axis=1)[wrong])

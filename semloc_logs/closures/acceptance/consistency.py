@@ -180,7 +180,7 @@ def _agrees(
 
     To within ``most`` metres and ``turn`` radians.
     """
-    off, trace = 0.0, 0.0
+    squared, trace = 0.0, 0.0
     for i in range(3):
         p = target_T_map[i, 3] - target_T_query[i, 3]
         for m in range(3):
@@ -189,8 +189,8 @@ def _agrees(
             for j in range(3):
                 r += target_T_map[i, j] * map_T_query[j, m]
             trace += r * target_T_query[i, m]
-        off += p * p
-    return bool(off <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
+        squared += p * p
+    return bool(squared <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +270,7 @@ def _place_odds(
         T = target_T_query[k]
         for n in range(first, end):
             U = target_T_query[n]
-            off = np.sqrt(
+            distance = np.sqrt(
                 (T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2
             )
             # the yaw of U inv(T); the axes of the base may point anywhere
@@ -281,11 +281,11 @@ def _place_odds(
             turned = abs(np.arctan2(sine, cosine))
             road = abs(target_road[k] - target_road[n])
             odds = np.exp(log_odds[n] - largest)
-            if off <= most and turned <= turn:
+            if distance <= most and turned <= turn:
                 place += odds
             elif not (
                 road > again
-                and off <= most + ODOMETRY_DRIFT * road
+                and distance <= most + ODOMETRY_DRIFT * road
                 and turned <= turn + TURN_DRIFT * road
             ):
                 rivals += odds

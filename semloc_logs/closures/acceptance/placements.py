@@ -57,14 +57,14 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], model
     road, target_road = np.zeros((2, n))
     map_T_query, target_T_query = np.zeros((2, n, 4, 4))
     posed = np.zeros(n, bool)
-    for (query_session, target_session), mine in rows.by_pair():
-        query, target = (rows.query_keyframe[mine], rows.target_keyframe[mine])
+    for (query_session, target_session), of_pair in rows.by_pair():
+        query, target = (rows.query_keyframe[of_pair], rows.target_keyframe[of_pair])
         session, other = (maps[query_session], maps[target_session])
-        road[mine] = session.distance[query]
-        target_road[mine] = other.distance[target]
-        map_T_query[mine] = session.map_T_base[query]
-        target_T_query[mine] = other.map_T_base[target] @ rows.target_T_query[mine]
-        posed[mine] = session.posed
+        road[of_pair] = session.distance[query]
+        target_road[of_pair] = other.distance[target]
+        map_T_query[of_pair] = session.map_T_base[query]
+        target_T_query[of_pair] = other.map_T_base[target] @ rows.target_T_query[of_pair]
+        posed[of_pair] = session.posed
     return Placed(
         *rows.sessions(),
         rows.query_keyframe,
@@ -124,7 +124,10 @@ def query_roads(placed: Placed) -> dict[str, F64]:
 def contradicts_odometry(placed: Placed, voxel_size: float) -> Bools:
     """Which alignments of a session with itself (n,) lie farther off than its odometry drifts."""
     own = (placed.query_session == placed.target_session) & placed.posed
-    off = np.linalg.norm(placed.map_T_query[:, :3, 3] - placed.target_T_query[:, :3, 3], axis=1)
+    distance = np.linalg.norm(
+        placed.map_T_query[:, :3, 3] - placed.target_T_query[:, :3, 3], axis=1
+    )
     return np.asarray(
-        own & (off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(placed.road - placed.target_road))
+        own
+        & (distance > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(placed.road - placed.target_road))
     )

@@ -82,14 +82,14 @@ def encode(
     ``metadata`` goes to the channels. Channels without messages are left out.
     """
     session = context.session
-    mine = [c for c in closures if session in (c.query_session, c.target_session)]
-    placed = [c for c in mine if c.query_session == session and c.session_T_query is not None]
+    of_session = [c for c in closures if session in (c.query_session, c.target_session)]
+    placed = [c for c in of_session if c.query_session == session and c.session_T_query is not None]
     pose_topics = topics_of_targets({c.target_session for c in placed})
     topics = [*TOPICS.items(), *((topic, Kind.POSE) for topic in pose_topics.values())]
     number = {topic: k for k, (topic, _) in enumerate(topics)}
     messages: list[NewMessage] = []
     marks: list[Mark] = []
-    for key, closure in enumerate(sorted(mine, key=_order)):
+    for key, closure in enumerate(sorted(of_session, key=_order)):
         _refuse_infinite(closure)
         is_query = closure.query_session == session
         stamp = closure.query_stamp_ns if is_query else closure.target_stamp_ns
@@ -107,7 +107,7 @@ def encode(
             messages.append(
                 NewMessage(number[MARKERS], log_time, encoder.markers([closure_markers(marks[-1])]))
             )
-    if mine:
+    if of_session:
         messages += _scene(context, encoder, number, marks)
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
     shared = {**context.facts.channel_metadata, **metadata}
