@@ -404,6 +404,8 @@ def test_poses_in_the_common_frame(
         if r.topic == "/semloc/tf" and r.message.transforms[0].child_frame_id == "semloc/common"
     }
     assert set(frames) == set(poses)
+    children = [r.message.transforms[0].child_frame_id for r in reads if r.topic == "/semloc/tf"]
+    assert children.count("base_link") == len(poses)  # the vehicle moves all the same
     for time, message in poses.items():
         stamp, frame_id = header(message)
         assert frame_id == "semloc/common"
