@@ -10,9 +10,11 @@ help:
 	@echo "make demo      two simulated drives, their loop closures, and an annotated log, in demo/"
 	@echo "make test      all tests"
 	@echo "make paper     every system of the paper on a small scene, in paper-quick/"
-	@echo "make docs      the documentation, in docs/build/; make reference writes its generated pages only"
+	@echo "make docs      the documentation, in docs/build/"
+	@echo "make reference the generated pages of the documentation only"
 	@echo "make fuzz      damaged messages and logs for MINUTES (1) from SEED (0) on"
-	@echo "make weights   the descriptor of 16 million subvolumes, in weights/, in runs of MINUTES (9); goes on where it stopped"
+	@echo "make weights   the descriptor of 16 million subvolumes, in weights/, in runs of MINUTES (9);"
+	@echo "               goes on where it stopped"
 	@echo "make lint      ruff and mypy"
 	@echo "make format    ruff format"
 	@echo "make wheel     the wheel, in dist/"
@@ -49,12 +51,20 @@ docs: reference $(VENV)/installed-docs
 fuzz: install
 	$(BIN)/python -P benchmarks/fuzz.py --minutes $(or $(MINUTES),1) --seed $(or $(SEED),0)
 
-# exit code 3 says that the minutes are over: a batch system starts the same command again, here a loop does, one variant in turn with the other
+# exit code 3: the minutes are over. A batch system starts the same command again; here a loop does,
+# one variant in turn with the other
 weights: install
-	@left="semantic geometric"; while [ -n "$$left" ]; do again=""; for variant in $$left; do \
-		$(BIN)/semloc train -o weights --variant $$variant --samples $(or $(SAMPLES),16000000) --scenes 4000 --set training.batch=48 \
-			--jobs $(or $(JOBS),1) --minutes $(or $(MINUTES),9); \
-		code=$$?; case $$code in 0) ;; 3) again="$$again $$variant" ;; *) exit $$code ;; esac; done; left="$$again"; done
+	@left="semantic geometric"; while [ -n "$$left" ]; do \
+		again=""; \
+		for variant in $$left; do \
+			$(BIN)/semloc train -o weights --variant $$variant --samples $(or $(SAMPLES),16000000) \
+				--scenes 4000 --set training.batch=48 --jobs $(or $(JOBS),1) \
+				--minutes $(or $(MINUTES),9); \
+			code=$$?; \
+			case $$code in 0) ;; 3) again="$$again $$variant" ;; *) exit $$code ;; esac; \
+		done; \
+		left="$$again"; \
+	done
 
 lint: install
 	$(BIN)/ruff check
@@ -70,4 +80,5 @@ wheel: install
 	$(BIN)/python -m build --wheel
 
 clean:
-	rm -rf $(VENV) build dist demo paper-quick docs/build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist demo paper-quick docs/build *.egg-info
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis
