@@ -15,9 +15,11 @@ import pytest
 
 import semloc_logs
 from semloc_logs.closures import search_tasks
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.closures.search_tasks import search_queries
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, rotation_angle, transform
 from semloc_logs.settings import Resolved
 from semloc_logs.stages import close as close_stage
@@ -28,7 +30,7 @@ from semloc_logs.stages import run as run_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
-from semloc_logs.tables.table import read_json, write_json
+from semloc_logs.tables.table import read_json, read_metadata, write_json
 from semloc_logs.workspace import Workspace
 
 Close = Callable[..., Report]
@@ -76,6 +78,49 @@ def test_overwriting_does_it_again(close: Close, coarse: Workspace, tools: Simpl
     alignments = {name for name in written if name.startswith("alignments/")}
     assert written - alignments == {"closures.parquet", "closures.png", "rejected.parquet"}
     assert alignments == {name for name in tables if name.startswith("alignments/")}
+
+
+def test_all_queries_are_decided_together(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Queries without alignments count, too; closures nearer than two queries are one."""
+    settings = tools.coarse_settings()
+    maps = {name: SessionMap(coarse.session(name)) for name in ("monday", "tuesday")}
+    queries = {name: query_keyframes(one, settings) for name, one in maps.items()}
+    given: dict[str, Any] = {}
+
+    def spy(name: str, place: int) -> Callable[..., Any]:
+        real = vars(close_stage)[name]
+
+        def spied(*args: Any) -> Any:
+            given[name] = args[place]
+            return real(*args)
+
+        return spied
+
+    for name, place in (("decide", 3), ("unique_closures", 2)):
+        monkeypatch.setattr(close_stage, name, spy(name, place))
+    assert was_done(close(overwrite=True))
+    assert given == {"decide": queries, "unique_closures": 8.0}
+    assert read_metadata(coarse.closures)["queries"] == sum(map(len, queries.values()))
+
+
+def test_a_session_that_does_not_fit_any_more_loses_its_closures(
+    close: Close, coarse: Workspace
+) -> None:
+    """Its alignments stay: it may be searched all the same."""
+    coarse.settings.unlink()
+    path = coarse.session("monday").session_json
+    write_json(path, read_json(path) | {"fit": {"track": "its poses jump", "streams": []}})
+    report = close(overwrite=True)
+    assert [sentence.split(":")[0] for sentence in report.skipped] == [
+        "Session monday gets no closures"
+    ]
+    for table in (coarse.closures, coarse.rejected):
+        rows = pq.read_table(table).to_pylist()
+        assert {row[f"{end}_session"] for row in rows for end in ("query", "target")} <= {"tuesday"}
+    assert coarse.alignments("tuesday", "monday").exists()
+    assert coarse.settings.exists()  # closing keeps the settings that it was done with
 
 
 @pytest.mark.parametrize("name", ["closures", "rejected", "alignments"])
