@@ -161,7 +161,7 @@ def test_a_log_that_was_being_annotated_is_repaired_first(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Killed in the middle of its end: what is read for a copy has to be whole."""
+    """Killed in the middle of its end: a copy needs a whole log."""
     log = Path(shutil.copyfile(drives["monday"].log, tmp_path / "monday.mcap"))
     whole = log.read_bytes()
     settings = tools.quick_settings()
