@@ -16,6 +16,7 @@ import pytest
 
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.errors import SemlocError
+from semloc_logs.exports.map_cloud import map_cloud
 from semloc_logs.logs.annotation import tail_swap
 from semloc_logs.logs.annotation.annotate import Results
 from semloc_logs.logs.annotation.scene import Drive
@@ -111,6 +112,16 @@ def test_a_map_of_points_has_no_drive(results_of: Make) -> None:
     results = results_of("monday", tuesday={"logs": [{"format": "map"}]})
     assert "semloc/tuesday" in placed(results)
     assert set(drives_of(results)) == {"monday", "wednesday"}
+
+
+def test_the_map_is_of_the_other_sessions(results_of: Make, labelled: Workspace) -> None:
+    """Its own points are in the log already."""
+    results = results_of("monday", lambda rows: [r for r in rows if "wednesday" not in r.values()])
+    others = [(SessionMap(labelled.session("tuesday")), placed(results)["semloc/tuesday"])]
+    expected = map_cloud(others, "odom")
+    assert expected is not None
+    assert results.scene.cloud is not None
+    np.testing.assert_array_equal(results.scene.cloud.points, expected.points)
 
 
 def test_a_log_without_closures_shows_its_own_map(results_of: Make) -> None:

@@ -16,18 +16,25 @@ import pytest
 
 import semloc_logs
 from semloc_logs.engines import Serial
-from semloc_logs.errors import LogError, WorkspaceError
+from semloc_logs.errors import (
+    LogError,
+    RemoteError,
+    SemlocError,
+    TemporaryError,
+    TopicError,
+    WorkspaceError,
+)
 from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
-from semloc_logs.settings import Resolved
+from semloc_logs.settings import Logs, Resolved, Settings, load
 from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.stages import fuse as fuse_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.report import Report
-from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.workspace import Workspace
 
 Fuse = Callable[..., Report]
@@ -455,3 +462,81 @@ def test_settings_of_reading_stay_with_their_session(
     assert recorded() == "0,0,2"
     assert was_done(fuse(overwrite=True))
     assert recorded() == "auto"
+
+
+# -- with a fusion that takes no time
+
+
+def log_of(folder: Path, name: str) -> SessionInput:
+    log = folder / f"{name}.mcap"
+    log.write_bytes(name.encode())
+    return SessionInput(name, (log,))
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(TemporaryError, TemporaryError), (TopicError, TopicError), (RemoteError, LogError)],
+)
+def test_a_fault_that_is_not_the_logs_is_not_remembered(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: type[SemlocError],
+    raised: type[SemlocError],
+) -> None:
+    """A server that is away, a topic that was named wrongly: the next run reads the log again."""
+
+    def fails(task: FuseTask, **options: Any) -> FusedSession:
+        raise error("It did not work.")
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", fails)
+    work = Workspace(tmp_path / "work")
+    settings = Settings().resolved()
+    with pytest.raises(raised, match="It did not work") as caught:
+        fuse_stage.fuse([log_of(tmp_path, "a")], work, settings, Serial())
+    assert type(caught.value) is raised
+    both = [log_of(tmp_path, name) for name in ("a", "b")]
+    with pytest.raises(raised):
+        fuse_stage.fuse(both, work, settings, Serial())
+    assert work.failures() == []
+
+
+def test_the_amount_is_the_seconds_of_all_logs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log without messages has no start; failures of before are forgotten."""
+    seconds: dict[str, list[int | None]] = {"a": [2, None], "b": [3]}
+
+    def quick(task: FuseTask, **options: Any) -> FusedSession:
+        logs = [
+            {"start_ns": None if end is None else 0, "end_ns": None if end is None else end * 10**9}
+            for end in seconds[task.folder.name]
+        ]
+        counts = {"keyframes": 0, "voxels": 0, "label_source": "log"}
+        write_json(task.folder.session_json, counts)
+        return FusedSession({"logs": logs, **counts}, ())
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", quick)
+    work = Workspace(tmp_path / "work")
+    write_json(work.failure("b"), {"reason": "It failed.", "fingerprint": ""})
+    sessions = [log_of(tmp_path, name) for name in ("a", "b")]
+    report = fuse_stage.fuse(sessions, work, Settings().resolved(), Serial())
+    assert report.done == ["a", "b"]
+    assert report.amount == 5.0
+    assert work.failures() == []
+
+
+def test_a_worker_with_a_disk_of_its_own_is_named(tmp_path: Path) -> None:
+    elsewhere: Any = SimpleNamespace(
+        jobs=1, map=lambda function, tasks: [FusedSession({}, ()) for _ in tasks]
+    )
+    work = Workspace(tmp_path / "work")
+    with pytest.raises(WorkspaceError, match="on a disk of its own"):
+        fuse_stage.fuse([log_of(tmp_path, "a")], work, Settings().resolved(), elsewhere)
+
+
+def test_memory_is_not_a_setting_of_a_session() -> None:
+    """How much may be used depends on the machine that reads the log now."""
+    present = {"settings": {"logs": Logs(up="+z", memory=1 << 30).model_dump(mode="json")}}
+    settings = load(assignments={"logs.memory": str(1 << 28)}).resolved()
+    read = fuse_stage._as_read_before(present, settings)
+    assert (read.logs.up, read.logs.memory) == ("+z", 1 << 28)
