@@ -4,11 +4,12 @@ beside others; interruptions.
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 import semloc_logs
@@ -19,7 +20,7 @@ from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.report import Report
-from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.workspace import Workspace
 
 Describe = Callable[..., Report]
@@ -57,6 +58,44 @@ def test_overwriting_does_it_again(
     assert tools.files(coarse.path) == tables
     written = {name for name, time in tools.write_times(coarse.path).items() if time != times[name]}
     assert written == {"sessions/tuesday/words.json", "sessions/tuesday/words/submap-00000.parquet"}
+
+
+def test_counts_of_several_submaps_go_to_their_sessions(
+    coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    """Monday has two submaps here, Tuesday one, of 1, 2 and 4 words."""
+    path = coarse.session("monday").session_json
+    content = read_json(path)
+    [submap] = content["submaps"]
+    write_json(path, content | {"submaps": [submap, submap | {"id": 1}]})
+    coarse.settings.unlink()
+    seen: list[tuple[str, int]] = []
+
+    def count(function: Any, tasks: Any) -> Iterator[int]:
+        for number, task in enumerate(tasks):
+            seen.append((task.folder.name, task.submap))
+            yield 2**number
+
+    engine: Any = SimpleNamespace(jobs=1, map=count)
+    settings = tools.coarse_settings()
+    report = describe_stage.describe(coarse, [], settings, engine, overwrite=True)
+    assert seen == [("monday", 0), ("monday", 1), ("tuesday", 0)]
+    words = {f.name: read_json(f.words_json)["words"] for f in coarse.sessions()}
+    assert words == {"monday": 3, "tuesday": 4}
+    assert report.amount == 3
+    assert coarse.settings.exists()
+
+
+def test_a_session_without_submaps_has_an_empty_table(
+    describe: Describe, coarse: Workspace
+) -> None:
+    """Readers find the columns of words all the same."""
+    folder = coarse.session("monday")
+    write_json(folder.session_json, read_json(folder.session_json) | {"submaps": []})
+    assert describe("monday", overwrite=True).done == ["monday"]
+    [table] = folder.words.glob("*.parquet")
+    assert pq.read_metadata(table).num_rows == 0
+    assert read_json(folder.words_json)["words"] == 0
 
 
 def test_a_session_that_was_fused_otherwise_is_described(
