@@ -54,8 +54,9 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 
 def _path(module: str) -> Path | None:
-    """The file of a module of ours; None for a package, a list of systems, or another name."""
+    """The file of a module of ours, or of a package; None for a list of systems or another name."""
     if module in _LISTS:
         return None
-    path = _ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
-    return path if path.is_file() else None
+    place = _ROOT.joinpath(*module.split(".")[1:])
+    files = (place.with_suffix(".py"), place / "__init__.py")
+    return next((path for path in files if path.is_file()), None)

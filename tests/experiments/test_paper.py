@@ -220,6 +220,9 @@ def test_the_version_of_a_module_changes_with_the_modules_that_it_imports() -> N
     system = module_version("semloc_logs.experiments.system")
     views = module_version("semloc_logs.experiments.views")
     assert system != views
+    # packages count with what they import
+    settings = module_version("semloc_logs.settings")
+    assert settings not in (module_version("semloc_logs.settings.sections"), module_version("x"))
     # of an entry that is added only its own row is new
     listed = module_version("semloc_logs.experiments.systems.catalogue")
     assert listed == module_version("semloc_logs.nothing")

@@ -47,7 +47,8 @@ from semloc_logs.workspace import Workspace
 Figures = dict[str, dict[str, float | str]]
 Note = Callable[[str], None]
 Task = OurTask | PeerTask
-FUSION = ("labels", "mapping", "numerics", "voxels")  # packages that decide about fused maps
+# packages that decide about fused maps
+FUSION = ("labels", "mapping", "numerics", "settings", "voxels")
 LOCALISATION = (*FUSION, "subvolumes", "words", "alignment", "closures")
 TIMED = ("ours", "ours, one frame", "ours, every heading described")
 
