@@ -39,7 +39,7 @@ def shared() -> Callable[[str], Path]:
     return find
 
 
-# helpers such as tests/lossy_disk.py are imported as tests.lossy_disk; the tests have no package
+# modules such as tests/lossy_disk.py are imported as tests.lossy_disk; the tests have no package
 tests = ModuleType("tests")
 tests.__path__ = [str(ROOT / "tests")]
 sys.modules.setdefault("tests", tests)
