@@ -264,3 +264,21 @@ def test_an_interrupted_session_is_done_again(
     assert tools.files(folder.path) == first, (
         "the old words.json must not speak for half of the new words"
     )
+
+
+def test_words_of_other_settings_are_not_vouched_for(
+    describe: Describe, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed when new words have their place and words.json is still to be written; then the old
+    settings are given again.
+    """
+
+    def killed(path: Path, content: dict[str, Any]) -> None:
+        raise KeyboardInterrupt
+
+    other = tools.coarse_settings(descriptor__variant="geometric")
+    with monkeypatch.context() as patch:
+        patch.setattr(describe_stage, "write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            describe("monday", settings=other)
+    assert describe("monday").done == ["monday"]
