@@ -9,10 +9,18 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.messages.stamps import utc
+from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.session import Session
-from semloc_logs.mapping.gravity import Expected, Gravity, find_gravity, given_gravity
+from semloc_logs.mapping.gravity import (
+    Expected,
+    Gravity,
+    UpSource,
+    find_gravity,
+    given_gravity,
+)
 from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.mapping.mounting_tilt import straight_way, turn_about_way
 from semloc_logs.mapping.up_direction import FlatPlaces, find_up
 from semloc_logs.mapping.up_evidence import UpEvidence
 from semloc_logs.numerics.transforms import inverse, rotation_between
@@ -30,12 +38,14 @@ DOWN_FRAMES = ("ned", "frd")  # z points down, in frames of this name or with it
 class Level:
     """``session_T_map`` (4, 4), and ``map_T_base`` (n, 4, 4) of every keyframe.
 
-    The map is level; ``gravity`` holds the evidence.
+    The map is level; ``gravity`` holds the evidence. ``tilt``: the angle (rad) about the way by
+    which the range sensors are mounted otherwise than the log has it; 0 where that is not known.
     """
 
     session_T_map: F64
     map_T_base: F64
     gravity: Gravity
+    tilt: float = 0.0
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -51,33 +61,54 @@ def level(session: Session, collected: Collected, fusion: Resolved) -> Level:
     """
     known = np.array([p for p in collected.poses if p is not None]).reshape(-1, 4, 4)
     places = collected.flat_places()
-    gravity = _gravity(session, places, known, fusion)
+    expected = _expected(session, known)
+    gravity = _gravity(expected, places, known, fusion)
     if not len(known):
         return Level(np.eye(4), _each_level(len(collected), places, gravity), gravity)
     session_T_map = np.eye(4)
     session_T_map[:3, :3] = rotation_between(UP, gravity.up)
     session_T_map[:3, 3] = known[0][:3, 3]
-    return Level(session_T_map, inverse(session_T_map) @ known, gravity)
+    is_mounted = any(frame_name(h.frame_id) != session.base_frame for h in collected.headers)
+    way = straight_way(known[:, :3, 3], fusion.fusion.voxel_size) if is_mounted else None
+    tilt = 0.0 if way is None else _tilt(expected, gravity, places, way)
+    return Level(session_T_map, inverse(session_T_map) @ known, gravity, tilt)
 
 
-def _gravity(
-    session: Session, places: dict[int, FlatPlaces], known: F64, settings: Resolved
-) -> Gravity:
-    """Up in the session frame, or without poses (``known`` (n, 4, 4)) in the base frame."""
+def _expected(session: Session, known: F64) -> Expected:
+    """Up as it is expected, in the frame that :func:`_gravity` gives it in."""
     posed = len(known) > 0
-    views = [*places.values()]
-    normals = np.concatenate([v.normals for v in views])
-    weights = np.concatenate([v.weights for v in views])
-    expected = Expected(
+    return Expected(
         session.name,
         (session.session_frame if posed else session.base_frame) or "session",
         _convention(session, known),
         session.imu_up_in_session() if posed else session.imu_up_in_base(),
         session.roles.imu or "",
     )
+
+
+def _tilt(expected: Expected, gravity: Gravity, places: dict[int, FlatPlaces], way: F64) -> float:
+    """The angle about the ``way`` (3,) by which ground and walls contradict gravity; else 0."""
+    if expected.imu is None or gravity.source is not UpSource.IMU:
+        return 0.0
+    normals, weights = _normals(places)
+    return turn_about_way(gravity.up, expected.imu, expected.convention, way, normals, weights)
+
+
+def _normals(places: dict[int, FlatPlaces]) -> tuple[F64, F64]:
+    """Normals (n, 3) and weights (n,) of all flat places."""
+    views = [*places.values()]
+    normals = np.concatenate([v.normals for v in views])
+    return normals, np.concatenate([v.weights for v in views])
+
+
+def _gravity(
+    expected: Expected, places: dict[int, FlatPlaces], known: F64, settings: Resolved
+) -> Gravity:
+    """Up in the session frame, or without poses (``known`` (n, 4, 4)) in the base frame."""
+    normals, weights = _normals(places)
     if settings.logs.up_vector is not None:
         return given_gravity(np.array(settings.logs.up_vector), normals, weights)
-    evidence = UpEvidence(views, known, settings.fusion.voxel_size / STREET_VOXEL)
+    evidence = UpEvidence([*places.values()], known, settings.fusion.voxel_size / STREET_VOXEL)
     return find_gravity(expected, normals, weights, evidence)
 
 

@@ -143,6 +143,7 @@ def _fused(task: FuseTask, session: Session, labeller: Labeller) -> _Fused:
         check_reach(session, collected, fusion.voxel_size)
         check = check_session(session, collected, fusion.voxel_size)
         levelled = level(session, collected, task.settings)
+        check.add_tilt(levelled.tilt, session.roles.imu or "")
         map_T_base = levelled.map_T_base
 
         def view(keyframe: int) -> KeyframeView:

@@ -14,6 +14,7 @@ from semloc_logs.logs.session.session import open_session
 from semloc_logs.mapping.fit.findings import SessionFit
 from semloc_logs.mapping.fit.fit_check import check_session
 from semloc_logs.mapping.keyframes import collect
+from semloc_logs.mapping.levelling import level
 from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.settings import Labels, Settings
 
@@ -26,7 +27,10 @@ def check_log(log: Path, settings: Settings, topics: Mapping[str, str]) -> Sessi
     with closing(open_session([log], options)) as session, tempfile.TemporaryDirectory() as folder:
         labeller = Labeller(Labels(source="uniform"), session)
         collected = collect(session, labeller, fusion, Path(folder), log.name)
-        return check_session(session, collected, fusion.voxel_size)
+        check = check_session(session, collected, fusion.voxel_size)
+        if check.fits and len(collected):
+            check.add_tilt(level(session, collected, resolved).tilt, session.roles.imu or "")
+        return check
 
 
 def with_fit(content: Mapping[str, Any], fit: SessionFit) -> dict[str, Any]:

@@ -125,6 +125,22 @@ class SessionFit:
     is_frozen: bool = False
     streams: list[StreamFit] = field(default_factory=list)
 
+    def add_tilt(self, angle: float, imu: str) -> None:
+        """Enters that gravity by the topic ``imu`` contradicts the map by an angle (rad); 0: not.
+
+        Other faults, which would turn the map, come first.
+        """
+        if not angle or not self.fits:
+            return
+        text = (
+            f"its mounting is turned by {abs(np.degrees(angle)):.1f} degrees about the way of the"
+            f" drive against {imu}: the ground and the walls beside the way are not level as it"
+            " measures gravity, which the frame of the poses has as well; correct the transform of"
+            " one of both"
+        )
+        for stream in self.streams:
+            stream.findings.append(Finding(Severity.WRONG, text))
+
     @property
     def fits(self) -> bool:
         """Whether nothing is known that would make closures false."""

@@ -8,6 +8,7 @@ each that explains much is named with its estimate.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,7 @@ from semloc_logs.mapping.fit.model import (
 )
 from semloc_logs.mapping.fit.other_starts import Doubted
 from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, near_reading
+from semloc_logs.mapping.fit.shared_surfaces import difference_text
 from semloc_logs.mapping.fit.way import other_distance, searched
 from semloc_logs.mapping.keyframes import Collected
 
@@ -81,6 +83,10 @@ AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
 DOUBTFUL = 15.0
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
+OTHER_UNIT = np.log(1.5)  # of the scale; what else differs then follows from it
+# clouds in a smaller unit than metres have few points in a cell, so that planes bring few points
+# together: they are compared in cells so many times as large
+SPARSE, COARSER = 0.15, 3.0
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
 
@@ -91,16 +97,36 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     check = SessionFit(session.pose_name, implausible(track), session.is_frozen)
     if not len(track) or check.jump is not None:
         return check
+    before: list[tuple[str, Clouds]] = []
     for topic in session.roles.ranging:
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
         span = session.sweep_span_of(topic)
         clouds = Clouds(collected, np.array(rows, np.int64), voxel, span)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         add_evident_faults(stream, session, clouds)
+        if not stream.findings:
+            _add_difference(stream, clouds, before, track.at_many)
+            before.append((topic, clouds))
         if not stream.is_wrong:
             stream.drift = local_drift(clouds)
         check.streams.append(stream)
     return check
+
+
+def _add_difference(
+    stream: StreamFit, clouds: Clouds, before: Sequence[tuple[str, Clouds]], poses_at: PosesAt
+) -> None:
+    """Compares a stream that fits the poses with the ones ``before`` it, by topic."""
+    for topic, others in before:
+        if text := difference_text(others, clouds, poses_at):
+            stream.findings.append(
+                Finding(
+                    Severity.WRONG,
+                    f"its mounting is off by {text} of the base frame beside the one of {topic},"
+                    " whose surfaces it sees: correct the transform of one of both",
+                )
+            )
+            return
 
 
 def check_stream(
@@ -113,6 +139,8 @@ def check_stream(
     count = len(clouds.rows) // KEYFRAMES_A_PAIR
     numbers = choose(clouds, min(max(count, FEWEST_PAIRS), MOST_PAIRS))
     given = registered(clouds, numbers)
+    if stream := _in_other_unit(topic, clouds, poses_at, given):
+        return stream
     if len(given.pairs) < LEAST_PAIRS:
         return _far_off(topic, clouds, poses_at, numbers, given)
     given = searched(clouds, given)
@@ -155,6 +183,23 @@ def _far_off(
         return unknown
     stream = _judged(topic, clouds, poses_at, found)
     return stream if stream.findings else unknown
+
+
+def _in_other_unit(
+    topic: str, clouds: Clouds, poses_at: PosesAt, given: Registered
+) -> StreamFit | None:
+    """The check of sparse clouds in larger cells, where these lie at another distance."""
+    is_sparse = not len(given.pairs) or float(np.median(given.share)) < SPARSE
+    if not is_sparse or clouds.sees_one_side():
+        return None
+    coarse = replace(clouds, voxel=COARSER * clouds.voxel)
+    numbers = choose(coarse, FEWEST_PAIRS)
+    found = registered(coarse, numbers)
+    far = other_distance(coarse, found) if len(found.pairs) >= LEAST_PAIRS else None
+    if far is None:
+        return None
+    stream = _judged(topic, coarse, poses_at, registered(coarse, numbers, far))
+    return stream if stream.findings else None
 
 
 def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:
@@ -264,11 +309,14 @@ def _with(pairs: Pairs, poses_at: PosesAt, estimate: Estimate, fault: Fault) -> 
 
 def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds: Clouds) -> None:
     """Enters a finding for each fault that matters."""
-    # other axes move the points of a sweep the wrong way as they are freed of the motion, which
-    # looks like a clock or a lever arm
+    # other axes and units move the points of a sweep the wrong way as they are freed of the motion,
+    # which looks like a clock or a lever arm
     turned = float(np.linalg.norm(_significant(estimate, Fault.ROTATION)[ROTATION]))
-    are_other_axes = Fault.ROTATION in faults and turned > OTHER_AXES
-    for fault in [Fault.ROTATION] if are_other_axes else faults:
+    if Fault.ROTATION in faults and turned > OTHER_AXES:
+        faults = [Fault.ROTATION]
+    elif abs(_significant(estimate, Fault.SCALE)[SCALE]) > OTHER_UNIT and Fault.SCALE in faults:
+        faults = [Fault.SCALE]
+    for fault in faults:
         known = _significant(estimate, fault)
         effect = _effect(known, fault, clouds)
         if effect >= NOTED:

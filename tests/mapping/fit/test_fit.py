@@ -230,7 +230,7 @@ def test_a_sensor_mounted_backwards_is_named_alone_and_not_as_optical(check: Che
     assert "optical" not in text
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.15])
+@pytest.mark.parametrize("scale", [0.5, 1.15, 3.281])
 def test_another_unit_is_found(check: Check, scale: float) -> None:
     fit = check(scale=scale)
     assert "times as far as the poses" in _only(fit)

@@ -1,0 +1,163 @@
+"""Whether the clouds of two range sensors of one vehicle lie on the same surfaces.
+
+Each sensor fits the poses alone where its mounting is shifted, as along the way or in its height.
+Where both see the same surfaces, clouds of both show how far their mountings differ.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.mapping.fit.findings import LEAST_PAIRS, LEAST_SIGMAS, NEAR_VOXELS, WRONG
+from semloc_logs.mapping.fit.keyframe_pairs import (
+    Clouds,
+    Registered,
+    Registrar,
+    Start,
+    motion,
+    registered,
+)
+from semloc_logs.mapping.fit.model import (
+    OUTLIER,
+    PARAMETERS,
+    PosesAt,
+    difference,
+    pose_motion,
+    scatter,
+)
+from semloc_logs.mapping.fit.way import BETTER
+from semloc_logs.numerics.evenly import evenly
+
+F64 = NDArray[np.float64]
+
+PAIRS = 24
+LONGEST_NS = 500_000_000  # between the clouds of a pair
+SHARED = 0.15  # of the points of one lie on planes of the other
+ROUNDS = 5  # of the weights of pairs that are off
+# walls lie on themselves along a street: what stands across shows a shift, from nearby alone, so it
+# is searched in these steps, up to so far (voxels), by so many pairs
+STEP, FARTHEST, TRIED = 0.3, 10.0, 6
+LEAST_SHOWN = np.array([0.01] * 3 + [0.002] * 3)  # m and rad, of a standard deviation
+MOST_STARTS = 8  # registrations, each from the offset of the one before
+
+
+def difference_text(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> str:
+    """How the mounting of ``others`` is off beside the one of ``clouds``; empty where it is not.
+
+    Both are streams of one session.
+    """
+    both, numbers = _pairs(clouds, others)
+    if len(numbers) < LEAST_PAIRS:
+        return ""
+    found = registered(both, numbers)
+    if len(found.pairs) < LEAST_PAIRS or float(np.median(found.share)) < SHARED:
+        return ""
+    shift = _searched(both, found)
+    if shift.any():
+        found = registered(both, numbers, _start(both, np.r_[shift, np.zeros(3)]))
+    offset, sigma = _offset(found, poses_at)
+    for _ in range(MOST_STARTS):
+        before = offset
+        if not _is_sure(offset, sigma):
+            break
+        found = registered(both, numbers, _start(both, offset))
+        if len(found.pairs) < LEAST_PAIRS:
+            return ""
+        offset, sigma = _offset(found, poses_at)
+        if (np.abs(offset - before) <= sigma).all():
+            break
+    known = np.where(np.abs(offset) >= LEAST_SIGMAS * sigma, offset, 0.0)
+    shown = np.maximum(sigma, LEAST_SHOWN)
+    distance = float(np.linalg.norm(known[:3])) / clouds.voxel
+    turn = float(np.linalg.norm(known[3:])) * NEAR_VOXELS
+    parts = []
+    if distance >= WRONG:
+        parts += [f"{known[k]:+.2f} \u00b1 {shown[k]:.2f} m along {'xyz'[k]}" for k in range(3)]
+    if turn >= WRONG:
+        degrees = np.degrees(np.r_[known[3:], shown[3:]])
+        parts += [
+            f"{degrees[k]:+.1f} \u00b1 {degrees[3 + k]:.1f} degrees about {'xyz'[k]}"
+            for k in range(3)
+        ]
+    used = [*(known[:3] if distance >= WRONG else []), *(known[3:] if turn >= WRONG else [])]
+    return ", ".join(part for part, value in zip(parts, used, strict=True) if value)
+
+
+def _searched(both: Clouds, found: Registered) -> F64:
+    """A shift (3,) of the second clouds on the level that far more across it shows; else zeros."""
+    registrar = Registrar(both)
+    distances = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * both.voxel
+    best = np.zeros(3)
+    most = 1.0
+    for direction in np.eye(3)[:2]:
+        shares = np.zeros(len(distances))
+        usual = 1e-9
+        for row in evenly(len(found.pairs), TRIED).tolist():
+            target, source = found.numbers[row].tolist()
+            measured = found.pairs.measured[row]
+            usual += float(registrar.shares_along(target, source, [measured], direction)[0])
+            given = motion(both, target, source)
+            tried = [given @ _moved(distance * direction) for distance in distances]
+            shares += registrar.shares_along(target, source, tried, direction)
+        better = float(shares.max()) / usual
+        if better > max(BETTER, most):
+            most = better
+            best = distances[int(np.argmax(shares))] * direction
+    return best
+
+
+def _moved(shift: F64) -> F64:
+    out = np.eye(4)
+    out[:3, 3] = shift
+    return out
+
+
+def _is_sure(offset: F64, sigma: F64) -> bool:
+    return bool((np.abs(offset) >= LEAST_SIGMAS * sigma).any())
+
+
+def _start(both: Clouds, offset: F64) -> Start:
+    """Registration starts where the second cloud is moved by ``offset`` (6,)."""
+    moved = _moved(offset[:3])
+    moved[:3, :3] = Rotation.from_rotvec(offset[3:]).as_matrix()
+    return lambda target, source: motion(both, target, source) @ moved
+
+
+def _pairs(clouds: Clouds, others: Clouds) -> tuple[Clouds, list[tuple[int, int]]]:
+    """The keyframes of both streams, and pairs of one of each at about the same time."""
+    both = Clouds(clouds.collected, np.r_[clouds.rows, others.rows], clouds.voxel)
+    count = len(clouds.rows)
+    mine = clouds.stamps_ns()
+    its = others.stamps_ns()
+    pairs = []
+    for number in evenly(count, PAIRS).tolist():
+        other = int(np.argmin(np.abs(its - mine[number])))
+        is_known = clouds.pose(number) is not None and others.pose(other) is not None
+        if is_known and abs(int(its[other]) - int(mine[number])) <= LONGEST_NS:
+            pairs.append((number, count + other))
+    return both, pairs
+
+
+def _offset(found: Registered, poses_at: PosesAt) -> tuple[F64, F64]:
+    """Translation (m) and rotation vector (rad) of the second clouds, (6,), and their deviations.
+
+    The mean of the pairs, each weighted by its covariance; pairs far off count less and less.
+    """
+    predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
+    off = -difference(found.pairs.measured, predicted)
+    known = np.isfinite(off).all(1)
+    off = off[known]
+    information = np.linalg.inv(found.pairs.covariance[known])
+    offset = np.median(off, axis=0)
+    squares = np.zeros(len(off))
+    hessian = information.sum(0)
+    for _ in range(ROUNDS):
+        rest = off - offset
+        squares = np.einsum("ni,nij,nj->n", rest, information, rest)
+        weighted = information / (1.0 + squares / OUTLIER**2)[:, None, None]
+        hessian = weighted.sum(0)
+        offset = np.linalg.solve(hessian, np.einsum("nij,nj->i", weighted, off))
+    covariance = scatter(squares) * np.linalg.inv(hessian)
+    return offset, np.sqrt(np.diag(covariance))

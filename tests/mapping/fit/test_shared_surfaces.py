@@ -1,0 +1,93 @@
+"""Two sensors in one street: how far the mounting of the second is off, as it was made."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.frames import Header, PosedCloud
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds
+from semloc_logs.mapping.fit.shared_surfaces import difference_text
+from semloc_logs.numerics.transforms import apply, exp_se3
+
+F64 = NDArray[np.float64]
+
+
+def second_sensor(
+    clouds: Clouds, offset: F64, *, late_ns: int = 0, beyond: float = -np.inf
+) -> tuple[Clouds, Clouds]:
+    """A stream, and another one whose mounting is off by ``offset`` (6,), from the same places.
+
+    Its stamps are ``late_ns`` later, and it sees what lies ``beyond`` x.
+    """
+    collected = clouds.collected
+    moved = exp_se3(-offset[:3], -offset[3:])
+    for number in range(len(clouds.rows)):
+        points = clouds.points(number)
+        points = apply(moved, points[points[:, 0] > beyond])
+        stamp_ns = int(clouds.stamps_ns()[number]) + late_ns
+        cloud = PosedCloud(
+            Header("/rear", stamp_ns, stamp_ns, "rear"),
+            points.astype(np.float32),
+            np.zeros(3, np.float32),
+            clouds.pose(number),
+            None,
+        )
+        collected.add(cloud, np.arange(len(points)))
+    rows = np.arange(len(clouds.rows), 2 * len(clouds.rows))
+    return clouds, Clouds(collected, rows, clouds.voxel)
+
+
+def steps(*values: float) -> F64:
+    """An offset (6,): metres, and degrees about x, y, z."""
+    return np.array([*values[:3], *np.radians(values[3:])])
+
+
+@pytest.fixture
+def drive(tmp_path: Path, streets: SimpleNamespace) -> tuple[Clouds, PoseTrack]:
+    clouds, track = streets.drive(tmp_path, streets.straight)
+    return clouds, track
+
+
+@pytest.mark.parametrize(
+    ("offset", "axis"),
+    [
+        (steps(0, 0, 1, 0, 0, 0), "m along z"),
+        (steps(-1.2, 0, 0, 0, 0, 0), "m along x"),
+        (steps(0, 0, 0, 4, 0, 0), "degrees about x"),
+    ],
+)
+def test_the_mounting_is_off_by_what_it_was_moved(
+    drive: tuple[Clouds, PoseTrack], offset: F64, axis: str
+) -> None:
+    """A straight drive hides each of them from the poses."""
+    clouds, track = drive
+    text = difference_text(*second_sensor(clouds, offset), track.at_many)
+    assert text.count("\u00b1") == 1
+    match = re.fullmatch(rf"([+-][0-9.]+) \u00b1 [0-9.]+ {axis}", text)
+    assert match is not None
+    made = np.r_[offset[:3], np.degrees(offset[3:])]
+    assert float(match[1]) == pytest.approx(made[np.flatnonzero(made)[0]], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("offset", "how"),
+    [
+        (steps(0, 0, 0, 0, 0, 0), {}),
+        (steps(0.1, 0, 0.1, 0, 0, 0), {}),  # less than a voxel
+        (steps(0, 0, 1, 0, 0, 0), {"late_ns": 6 * 10**8}),  # none at about the same time
+        (steps(0, 0, 1, 0, 0, 0), {"beyond": 30.0}),  # it sees none of the surfaces
+    ],
+)
+def test_nothing_is_said_where_mountings_agree_or_nothing_shows_it(
+    drive: tuple[Clouds, PoseTrack], offset: F64, how: dict[str, float]
+) -> None:
+    clouds, track = drive
+    clouds = Clouds(clouds.collected, clouds.rows[:1] if "late_ns" in how else clouds.rows, 0.3)
+    assert difference_text(*second_sensor(clouds, offset, **how), track.at_many) == ""  # type: ignore[arg-type]
