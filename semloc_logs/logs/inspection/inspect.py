@@ -134,7 +134,7 @@ class _Inspection:
         self._decoder = Decoder(self._undecodable)
         reading = reading_of(settings, self._roles, log.streams, log.path.name)
         self._clocks = TopicClocks(reading)
-        self._stamp_offsets = StampOffsets()
+        self._stamp_offsets = StampOffsets(reading.offset_ns)
         self._facts: dict[str, dict[str, object]] = {}
         self._ranging = {*self._roles.ranging, *self._roles.topics("stereo_right")}
         self._pictures = {

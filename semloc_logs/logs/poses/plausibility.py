@@ -22,6 +22,7 @@ FASTEST = 120.0  # m/s; trains are slower
 NEIGHBOURS = 5  # steps on either side that tell the speed around a step
 # two sources in turn: so large a share of the poses is left at once
 INTERLEAVED = 0.1
+EXACTLY = 0.3  # of the poses that jump are at one pose, to which they jump each time
 # a track that begins again: its pose is the identity but for this (m, rad), far from where it was
 AT_IDENTITY, TURNED_AT_IDENTITY = 0.1, 0.02
 FAR = 2.0
@@ -143,6 +144,8 @@ def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses:
     steadily; noise does not. A clock that was set back mixes the poses of a short stretch with
     later ones.
     """
+    if unfilled := _at_one_pose(stamps_ns, to_and_fro, poses):
+        return unfilled
     if set_back := _mixed_by_clock(stamps_ns, to_and_fro, poses):
         return set_back
     chords = np.linalg.norm(poses[2:, :3, 3] - poses[:-2, :3, 3], axis=1)[to_and_fro]
@@ -160,6 +163,31 @@ def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses:
         f" {distance:.1f} m in the median: {cause}"
     )
     return Jump(tuple(stamps_ns[1:-1][to_and_fro].tolist()), text)
+
+
+def _at_one_pose(
+    stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses: F64
+) -> Jump | None:
+    """Poses that jump to exactly one pose each time, such as the identity, which was never filled
+    in.
+    """
+    rows = np.flatnonzero(to_and_fro) + 1
+    values, counts = np.unique(poses[rows].reshape(len(rows), -1), axis=0, return_counts=True)
+    most = int(np.argmax(counts))
+    at_value = (poses.reshape(len(poses), -1) == values[most]).all(1)
+    # a pose between two such ones jumps as well
+    beside = np.r_[at_value[1:], False] | np.r_[False, at_value[:-1]]
+    if counts[most] < max(3, EXACTLY * len(rows)) or not (at_value | beside)[rows].all():
+        return None
+    is_identity = np.array_equal(values[most].reshape(4, 4), np.eye(4))
+    what = "the identity" if is_identity else "one pose"
+    distance = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[rows]))
+    text = (
+        f"{int(at_value.sum())} of its {len(stamps_ns)} poses are exactly {what}, {distance:.1f} m"
+        " from the ones beside them in the median: their publisher sends it where it does not know"
+        " the pose; leave these out, or use --odometry lidar"
+    )
+    return Jump(tuple(stamps_ns[at_value].tolist()), text)
 
 
 def _mixed_by_clock(

@@ -167,6 +167,10 @@ class Session:
         poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
         return 0.0 if poses is None else steady_shift(self.stamp_offsets, topic, poses)
 
+    def time_offset_of(self, topic: str) -> float:
+        """What the settings add to the stamps of a topic (s)."""
+        return self.stamp_offsets.added(topic)
+
     def off_stamp_of(self, topic: str) -> float:
         """From the header of sweeps to their nearest point (s), where most are far off; else 0."""
         return self._pass.tally.off_stamp(topic)
@@ -388,4 +392,6 @@ class Session:
         limits = RangeLimits(options.min_range, options.max_range)
         builder = CloudBuilder(roles, poses, cameras, duplicates, limits)
         most_bytes = self._options.logs.memory // _SHARE_OF_WAITING
-        return CloudPass(roles, poses, cameras, builder, relay, most_bytes)
+        new = CloudPass(roles, poses, cameras, builder, relay, most_bytes)
+        new.stamp_offsets = StampOffsets(self._reading.offset_ns)
+        return new

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -60,10 +60,12 @@ class StampOffset:
 class StampOffsets:
     """Offsets of the topics of a pass, in bounded memory; a moving edge of TF counts as a topic.
 
-    The stamps are the ones that are used: with ``logs.time_offset`` added.
+    The stamps are the ones that are used: with ``logs.time_offset`` added, which is ``added_ns`` by
+    topic.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, added_ns: Mapping[str, int] | None = None) -> None:
+        self._added_ns = added_ns or {}
         self._topics: dict[str, _Samples] = {}
 
     def take(self, frame: Frame) -> None:
@@ -83,6 +85,10 @@ class StampOffsets:
     def topics(self) -> list[str]:
         """The topics that were seen, sorted; TF as :func:`edge_topic`."""
         return sorted(self._topics)
+
+    def added(self, topic: str) -> float:
+        """What the settings add to the stamps of a topic already (s); a new offset replaces it."""
+        return self._added_ns.get(topic.partition(" ")[0], 0) * 1e-9
 
     def of(self, topic: str) -> StampOffset | None:
         """The offset of a topic; None without messages."""
@@ -234,7 +240,7 @@ def _problems(
     is_reference_off = _is_impossible(usual) and not any(map(_is_impossible, stamped.values()))
     if is_reference_off:
         different = [different[0].swapped()]
-    return problems + [difference.problem() for difference in different]
+    return problems + [d.problem(offsets.added(d.topic)) for d in different]
 
 
 def _is_impossible(offset: StampOffset) -> bool:
@@ -276,14 +282,15 @@ class _Difference:
             self.other, self.its, self.topic, self.offset, -self.shift, self.is_assumed
         )
 
-    def problem(self) -> Problem:
+    def problem(self, added: float) -> Problem:
+        """The sentence, where the settings have ``added`` seconds to the stamps already."""
         shift, cause = _usual_shift(self.shift)
         topic = self.topic.partition(" ")[0]
         size = f"{_duration(shift)} ({cause})" if cause else f"about {_duration(shift)}"
         text = (
             f"{self.topic}: its header stamps are {_beside_log_time(self.offset.median)}, the ones "
             f"of {self.other} {_beside_log_time(self.its.median)}: their clocks differ by {size}; "
-            f"give --set logs.time_offset.{topic}={shift:.2f}, or --stamps log."
+            f"give --set logs.time_offset.{topic}={shift + added:.2f}, or --stamps log."
         )
         return Problem(topic, ProblemKind.STAMP, text, lost=False, assumed=self.is_assumed)
 

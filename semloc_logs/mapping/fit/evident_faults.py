@@ -10,6 +10,7 @@ from collections.abc import Set
 import numpy as np
 
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.fault_texts import rounded
 from semloc_logs.mapping.fit.findings import (
     NEAR_VOXELS,
     WRONG,
@@ -36,13 +37,13 @@ def add_evident_faults(stream: StreamFit, session: Session, clouds: Clouds) -> N
     cause = (
         _stuck(session, topic)
         or _mounting_text(session, clouds.frames(), clouds.voxel)
-        or _far_clock_text(topic, session.shift_of(topic))
+        or _far_clock_text(topic, session.shift_of(topic), session.time_offset_of(topic))
         or _coarse_poses_text(session, clouds)
     )
     if cause:
         stream.findings = [Finding(Severity.WRONG, cause)]
     lead = session.lead_of(topic)
-    _add(stream, lead, clouds, _lead_text(topic, lead))
+    _add(stream, lead, clouds, _lead_text(topic, lead, clouds.time_offset))
     off_stamp = session.off_stamp_of(topic)
     _add(stream, off_stamp, clouds, _off_stamp_text(off_stamp))
 
@@ -93,7 +94,7 @@ def _coarse_poses_text(session: Session, clouds: Clouds) -> str:
     )
 
 
-def _far_clock_text(topic: str, shift: float) -> str:
+def _far_clock_text(topic: str, shift: float, added: float) -> str:
     """Stamps that are farther off beside their recording than the search for a clock reaches.
 
     What the search found is something else then. No sensor is recorded so late, poses hardly are.
@@ -106,7 +107,7 @@ def _far_clock_text(topic: str, shift: float) -> str:
     remedy = (
         "correct the stamps of one of both"
         if abs(shift) > LATEST_POSES
-        else f"give --set logs.time_offset.{topic}={shift:+.2f}, or --stamps log"
+        else f"give --set logs.time_offset.{topic}={rounded(shift + added)}, or --stamps log"
     )
     return (
         f"its stamps are {abs(shift):.2f} s {side} beside their recording than the ones of the"
@@ -124,12 +125,12 @@ def _add(stream: StreamFit, seconds: float, clouds: Clouds, text: str) -> None:
         stream.findings.append(Finding(Severity.WRONG, text))
 
 
-def _lead_text(topic: str, lead: float) -> str:
-    """Stamps that are later than their recording."""
+def _lead_text(topic: str, lead: float, added: float) -> str:
+    """Stamps that are later than their recording, with ``added`` seconds."""
     return (
         f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
         " poses are not: its clock is another one, or was set; give --set logs.time_offset."
-        f"{topic}={-lead:+.2f} where this holds for the whole log, else cut the log"
+        f"{topic}={rounded(added - lead)} where this holds for the whole log, else cut the log"
     )
 
 

@@ -13,8 +13,10 @@ from semloc_logs.mapping.fit.model import CLOCK, ROTATION, SCALE, Fault
 
 F64 = NDArray[np.float64]
 OTHER_END = 0.5, 1.5  # of a sweep: an offset may be from its other end
+BENT = 0.5  # of a sweep: in drives of 50 and 130 m offsets of clocks were off by 0.5 of it at most
 MIRRORED = 0.25  # of a shift, by which it differs from twice the mounting it is of
 HARDLY_MOVE = 0.05  # times as far as the poses: registration may have found no motion at all
+FOOT, NEAR_FOOT = np.log(1 / 0.3048), 0.03  # of the logarithm of a scale
 OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
 
 
@@ -23,15 +25,18 @@ def fault_text(
 ) -> str:
     """The sentence's end about a fault with these parameters (8,)."""
     if fault is Fault.CLOCK:
-        return _clock_text(topic, known, sigma, clouds.span)
+        return _clock_text(topic, known, sigma, clouds)
     if fault is Fault.LEVER:
         return _lever_text(known, sigma, clouds.mounting())
     return _rotation_text(known, sigma) if fault is Fault.ROTATION else _scale_text(known, sigma)
 
 
-def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], span: float) -> str:
+def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], clouds: Clouds) -> str:
     offset = float(parameters[CLOCK])
     side = "behind" if offset > 0 else "ahead of"
+    span = clouds.span
+    # points were freed of the motion at the wrong time, which shifts the estimate by some of a sweep
+    spread = max(sigma(CLOCK), 0.01, BENT * span)
     least, most = OTHER_END
     ends = ""
     if least * span <= abs(offset) <= most * span:
@@ -40,9 +45,14 @@ def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], span
             " from its other end)"
         )
     return (
-        f"its stamps are {abs(offset):.2f} \u00b1 {max(sigma(CLOCK), 0.01):.2f} s {side} the clock"
-        f" of the poses{ends}; give --set logs.time_offset.{topic}={offset:+.2f}"
+        f"its stamps are {abs(offset):.2f} \u00b1 {spread:.2f} s {side} the clock"
+        f" of the poses{ends}; give --set logs.time_offset.{topic}={rounded(offset + clouds.time_offset)}"
     )
+
+
+def rounded(seconds: float) -> str:
+    """An offset for the settings, with its sign; a zero has a plus."""
+    return f"{round(seconds, 2) + 0.0:+.2f}"
 
 
 def _rotation_text(parameters: F64, sigma: Callable[[int], float]) -> str:
@@ -96,7 +106,8 @@ def _scale_text(parameters: F64, sigma: Callable[[int], float]) -> str:
             " the poses are in another unit or along other axes, or the clouds are not of the time"
             " of their stamps"
         )
+    unit = " (a foot is 0.305 m)" if abs(abs(parameters[SCALE]) - FOOT) < NEAR_FOOT else ""
     return (
         f"its clouds move {factor:.3f} \u00b1 {factor * sigma(SCALE):.3f} times as far as the"
-        " poses: one of both is not in metres, or the odometry is badly scaled"
+        f" poses: one of both is not in metres{unit}, or the odometry is badly scaled"
     )

@@ -101,7 +101,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     for topic in session.roles.ranging:
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
         span = session.sweep_span_of(topic)
-        clouds = Clouds(collected, np.array(rows, np.int64), voxel, span)
+        added = session.time_offset_of(topic)
+        clouds = Clouds(collected, np.array(rows, np.int64), voxel, span, added)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         add_evident_faults(stream, session, clouds)
         if not stream.findings:

@@ -61,12 +61,14 @@ class Clouds:
     """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m).
 
     ``span``: from the first to the last point of a sweep (s), 0 without times of points.
+    ``time_offset``: what the settings add to the stamps already (s).
     """
 
     collected: Collected
     rows: I64
     voxel: float
     span: float = 0.0
+    time_offset: float = 0.0
 
     def stamps_ns(self) -> I64:
         """Their stamps (n,)."""

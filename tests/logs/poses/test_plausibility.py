@@ -60,6 +60,20 @@ def test_two_publishers_in_turn_are_recognised() -> None:
     assert len(jump.stamps_ns) > 150
 
 
+@pytest.mark.parametrize("is_identity", [True, False])
+def test_poses_that_are_not_known_at_times_are_no_second_publisher(is_identity: bool) -> None:
+    """Every seventh pose, from the 14th on, is the identity, or another one that stays."""
+    poses = _drive()
+    poses[14::7] = np.eye(4) if is_identity else yaw_transform(0.5, (-40.0, 9.0, 0.0))
+    jump = implausible(_track(poses))
+    assert jump is not None
+    # the first pose of the drive is the identity
+    what = "28 of its 200 poses are exactly the identity, "
+    assert (what if is_identity else "27 of its 200 poses are exactly one pose, ") in jump.text
+    assert "their publisher sends it where it does not know the pose" in jump.text
+    assert len(jump.stamps_ns) == (28 if is_identity else 27)
+
+
 def test_noisy_poses_are_not_taken_for_two_publishers() -> None:
     poses = _drive()
     poses[:, :2, 3] += np.random.default_rng(3).normal(0, 0.6, (200, 2))

@@ -117,6 +117,20 @@ def test_sweeps_of_another_clock_are_named_with_the_shift(
     assert problem.text in inspect_log(path)["skipped"]  # type: ignore[operator]
 
 
+@pytest.mark.parametrize(("given", "wanted"), [(-30.0, "-36.90"), (4.0, "-36.90")])
+def test_the_offset_that_is_named_replaces_the_one_that_is_given(
+    recorder: Recorder, given: float, wanted: str
+) -> None:
+    """36.9 s ahead of their recording in all: what the settings add already is part of it."""
+    path = drive(recorder, sweeps=37.0)
+    session, _ = fused(path, time_offset={"/points": given})
+    [problem] = stamp_problems(session)
+    assert f"--set logs.time_offset./points={wanted}, or --stamps log" in problem.text
+    assert session.time_offset_of("/points") == pytest.approx(given)
+    logs = Logs(time_offset={"/points": given})
+    assert problem.text in inspect_log(path, logs=logs)["skipped"]  # type: ignore[operator]
+
+
 @pytest.mark.parametrize(("ahead", "is_assumed"), [(0.01, None), (0.05, False), (0.2, True)])
 def test_stamps_that_are_a_little_later_than_their_recording(
     recorder: Recorder, ahead: float, is_assumed: bool | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -114,7 +115,10 @@ def test_the_offset_of_a_real_depth_camera_is_found(
     topic = "/camera/depth/image"
     offset = {f"logs.time_offset.{topic}": str(late), "fusion.voxel_size": "0.05"}
     [stream] = check_log(log, load(assignments=offset), {}).streams
-    assert f"--set logs.time_offset.{topic}={-late:+.1f}" in _only(stream)
+    side = "ahead of" if late > 0 else "behind"
+    assert re.match(rf"its stamps are {abs(late)}[0-9] \u00b1 0.0[0-9] s {side}", _only(stream))
+    # the offset that made the fault is to be left out
+    assert re.search(rf"--set logs.time_offset.{topic}=[+-]0\.0[0-2]$", _only(stream))
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -195,6 +199,19 @@ def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
         text = _only(check_stream(TOPIC, replace(clouds, span=span), track.at_many))
         assert "its stamps are 0.1" in text
         assert (f"a sweep takes {span:.2f} s" in text) == is_told
+
+
+def test_an_offset_is_added_to_the_one_that_is_given_and_as_sure_as_the_sweep_is_short(
+    tmp_path: Path, streets: SimpleNamespace
+) -> None:
+    """0.4 s late in all, of which the settings have put right what is given."""
+    clouds, track = streets.drive(tmp_path, clock=0.4)
+    for given, wanted in ((0.0, "-0.40"), (-0.25, "-0.65"), (0.1, "-0.30")):
+        text = _only(check_stream(TOPIC, replace(clouds, time_offset=given), track.at_many))
+        assert f"logs.time_offset.{TOPIC}={wanted}" in text
+    for span, sigma in ((0.0, "0.01"), (0.1, "0.05")):
+        text = _only(check_stream(TOPIC, replace(clouds, span=span), track.at_many))
+        assert f"its stamps are 0.40 \u00b1 {sigma} s ahead" in text
 
 
 def test_a_straight_and_steady_drive_hides_clock_and_lever_arm_and_says_so(
