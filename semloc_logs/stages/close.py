@@ -14,6 +14,7 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
+from semloc_logs.closures.other_mountings import contradictions
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.closures.same_recording import same_recordings
 from semloc_logs.closures.session_pairs import Pair, known_pairs
@@ -61,6 +62,7 @@ def close(
     report.skipped += misfits.values()
     fitting = {name: m for name, m in search.maps.items() if name not in misfits}
     report.skipped += same_recordings(fitting)
+    report.skipped += _contradicting(fitting, settings).values()
     (report.done if is_new else report.kept).append("closures")
     return report
 
@@ -126,10 +128,25 @@ def _searched(pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> dict[str
 def _used_alignments(
     work: Workspace, maps: Maps, settings: Resolved, known: Mapping[Pair, str]
 ) -> dict[Pair, Path]:
-    """The tables of alignments of the pairs of sessions whose poses fit."""
+    """The tables of alignments of the pairs of sessions whose poses fit, and whose mountings do."""
     misfits = misfits_of(maps, settings)
     pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
+    names = {name for pair in pairs for name in (pair.query, pair.target)}
+    others = _contradicting({name: maps[name] for name in names}, settings)
+    pairs = [p for p in pairs if frozenset((p.query, p.target)) not in others]
     return {pair: work.alignments(pair.query, pair.target) for pair in pairs}
+
+
+def _contradicting(maps: Maps, settings: Resolved) -> dict[frozenset[str], str]:
+    """Pairs of sessions without closures, since their mountings contradict each other, and why."""
+    if settings.closures.misfits:
+        return {}
+    return {
+        pair: f"Sessions {' and '.join(sorted(pair))} get no closures with each other: {text};"
+        " give the right mounting with --set logs.mountings.FRAME=[x,y,z,qx,qy,qz,qw], or search"
+        " them all the same with --set closures.misfits=true, as where they are of two vehicles."
+        for pair, text in contradictions(maps).items()
+    }
 
 
 def _decided_from(known: Mapping[Pair, str], settings: Resolved) -> str:

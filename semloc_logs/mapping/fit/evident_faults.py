@@ -42,8 +42,12 @@ def add_evident_faults(stream: StreamFit, session: Session, clouds: Clouds) -> N
     )
     if cause:
         stream.findings = [Finding(Severity.WRONG, cause)]
-    lead = session.lead_of(topic)
-    _add(stream, lead, clouds, _lead_text(topic, lead, clouds.time_offset))
+    # of the other pictures of a stereo pair as well: depths come from both
+    is_stereo = topic in session.roles.topics("stereo_left")
+    for part in (topic, *(session.roles.topics("stereo_right") if is_stereo else ())):
+        lead = session.lead_of(part)
+        text = _lead_text(stream.topic, part, lead, session.time_offset_of(part))
+        _add(stream, lead, clouds, text)
     off_stamp = session.off_stamp_of(topic)
     _add(stream, off_stamp, clouds, _off_stamp_text(off_stamp))
 
@@ -125,12 +129,16 @@ def _add(stream: StreamFit, seconds: float, clouds: Clouds, text: str) -> None:
         stream.findings.append(Finding(Severity.WRONG, text))
 
 
-def _lead_text(topic: str, lead: float, added: float) -> str:
-    """Stamps that are later than their recording, with ``added`` seconds."""
+def _lead_text(topic: str, part: str, lead: float, added: float) -> str:
+    """Stamps of a ``part`` of a stream that are later than their recording.
+
+    The settings have ``added`` so much (s) to its stamps.
+    """
+    whose = "its stamps" if part == topic else f"the stamps of {part}"
     return (
-        f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
-        " poses are not: its clock is another one, or was set; give --set logs.time_offset."
-        f"{topic}={rounded(added - lead)} where this holds for the whole log, else cut the log"
+        f"{whose} are up to {lead:.2f} s later than their recording, which the stamps of the"
+        " poses are not: the clock is another one, or was set; give --set logs.time_offset."
+        f"{part}={rounded(added - lead)} where this holds for the whole log, else cut the log"
     )
 
 

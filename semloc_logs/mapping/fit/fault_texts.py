@@ -35,7 +35,7 @@ def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], clou
     offset = float(parameters[CLOCK])
     side = "behind" if offset > 0 else "ahead of"
     span = clouds.span
-    # points were freed of the motion at the wrong time, which shifts the estimate by some of a sweep
+    # points were freed of the motion at the wrong time, which shifts the estimate
     spread = max(sigma(CLOCK), 0.01, BENT * span)
     least, most = OTHER_END
     ends = ""
@@ -46,7 +46,8 @@ def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], clou
         )
     return (
         f"its stamps are {abs(offset):.2f} \u00b1 {spread:.2f} s {side} the clock"
-        f" of the poses{ends}; give --set logs.time_offset.{topic}={rounded(offset + clouds.time_offset)}"
+        f" of the poses{ends}; give --set logs.time_offset.{topic}="
+        f"{rounded(offset + clouds.time_offset)}"
     )
 
 

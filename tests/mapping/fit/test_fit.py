@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import re
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
