@@ -26,7 +26,7 @@ ALIKE = 0.5  # of a difference of mountings in height, by which the sensor is as
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounted:
-    """What a session says of its mountings.
+    """The mountings of a session.
 
     ``base_T_sensors`` (4, 4) by frame; ``hidden``: faults that its drive does not show; ``height``:
     of the base frame above the ground (m); nan where no ground was seen.
@@ -57,7 +57,7 @@ class Mounted:
 
 
 def contradictions(maps: Mapping[str, SessionMap]) -> dict[frozenset[str], str]:
-    """The pairs of sessions that contradict each other, with a sentence's end that says how."""
+    """The pairs of sessions that contradict each other, with the end of a sentence about them."""
     mounted = {name: Mounted.of(m) for name, m in sorted(maps.items()) if m.posed and not m.is_map}
     found = {}
     for (name, one), (other_name, other) in combinations(mounted.items(), 2):

@@ -36,8 +36,8 @@ PAIRS = 24
 LONGEST_NS = 500_000_000  # between the clouds of a pair
 SHARED = 0.15  # of the points of one lie on planes of the other
 ROUNDS = 5  # of the weights of pairs that are off
-# walls lie on themselves along a street: what stands across shows a shift, from nearby alone, so it
-# is searched in these steps, up to so far (voxels), by so many pairs
+# walls lie on themselves along a street: surfaces across show a shift, from nearby alone, so it is
+# searched in these steps, up to so far (voxels), by so many pairs
 STEP, FARTHEST, TRIED = 0.3, 10.0, 6
 LEAST_SHOWN = np.array([0.01] * 3 + [0.002] * 3)  # m and rad, of a standard deviation
 MOST_STARTS = 8  # registrations, each from the offset of the one before
