@@ -21,6 +21,7 @@ F64 = NDArray[np.float64]
 
 # voxels by which such a difference moves a closure, at least; 0.75 m or 4.3 degrees at street scale
 LEAST = 2.5
+OTHER_AXES = np.radians(20.0)  # base frames that differ by more have other axes, such as NED
 ALIKE = 0.5  # of a difference of mountings in height, by which the sensor is as high all the same
 
 
@@ -76,6 +77,8 @@ def contradiction(one: Mounted, other: Mounted) -> str:
         second = other.base_T_sensors[frame]
         shift = first[:3, 3] - second[:3, 3]
         turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()
+        if np.linalg.norm(turn) > OTHER_AXES:
+            continue
         height = one.height - other.height
         for k, axis in enumerate("xyz"):
             if abs(turn[k]) * NEAR_VOXELS > LEAST and f"rotation_{axis}_rad" in hidden:

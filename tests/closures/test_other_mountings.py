@@ -47,6 +47,7 @@ def test_mountings_of_which_one_is_wrong_are_named(other: Mounted, words: str) -
         session(z=0.0, height=np.nan),
         session(x=1.8),  # another vehicle, whose drive showed that its mounting fits
         session(x=0.9, hidden=("lever_x_m",)),  # 0.6 m: 2 voxels
+        session(z=-1.9, roll=180.0, hidden=("rotation_x_rad",)),  # a base frame with z down
         session(roll=4.0, hidden=("rotation_x_rad",)),
         session(x=1.8, hidden=("lever_y_m", "rotation_x_rad")),
         session(x=1.8, hidden=("lever_x_m",), base="body"),

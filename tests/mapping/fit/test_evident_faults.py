@@ -1,4 +1,4 @@
-"""Faults that show without a registration, of a session that says them itself."""
+"""Faults that show without a registration, as a session has them."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
 def test_an_offset_is_added_to_the_one_that_is_given_and_as_sure_as_the_sweep_is_short(
     tmp_path: Path, streets: SimpleNamespace
 ) -> None:
-    """0.4 s late in all, of which the settings have put right what is given."""
+    """0.4 s late in all; the settings have put a part right."""
     clouds, track = streets.drive(tmp_path, clock=0.4)
     for given, wanted in ((0.0, "-0.40"), (-0.25, "-0.65"), (0.1, "-0.30")):
         text = _only(check_stream(TOPIC, replace(clouds, time_offset=given), track.at_many))
