@@ -128,6 +128,13 @@ BASELINES: tuple[Entry, ...] = (
         "scan_registration:make_kiss_matcher",
         extra="baselines",
     ),
+    Entry(
+        "map-closures",
+        "MapClosures + GICP",
+        "scan_registration:make_map_closures",
+        extra="baselines",
+        remark="A local map is one view, as large as a query; it is made for 100 m of driving.",
+    ),
 )
 
 

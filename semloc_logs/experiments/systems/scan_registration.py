@@ -1,9 +1,9 @@
-"""Peers of today on single scans: places by Scan Context, poses by generalised ICP (small_gicp) or
-by KISS-Matcher (Lim et al. 2025).
+"""Peers of today on single scans: places by Scan Context or by MapClosures (Gupta et al. 2024),
+poses by generalised ICP (small_gicp) or by KISS-Matcher (Lim et al. 2025).
 
-Scan Context finds the place and the heading; the registration of the best places gives the pose.
-small_gicp and kiss-matcher are in the extra ``baselines``. Without small_gicp our own fit on points
-takes its part.
+Similar places give a start, and the registration of the best of them the pose. small_gicp,
+kiss-matcher and map-closures are in the extra ``baselines``. Without small_gicp our own fit on
+points takes its part.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.level_maps import level_points
 from semloc_logs.mapping.selection import thin
+from semloc_logs.numerics.local_shape import shape
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 
 F32 = NDArray[np.float32]
@@ -37,8 +39,72 @@ REACHES = (3.0, 1.0)  # m, of correspondences, one after the other
 KISS_VOXEL = 0.5  # m
 LEAST_KISS_INLIERS = 5
 GICP_CANDIDATES, KISS_CANDIDATES = 20, 10
+NORMAL_CELL = 1.0  # m: of the points whose normals MapClosures gets
+NORMAL_NEIGHBOURS = 20
+APART = 10  # between the numbers of scans: MapClosures compares none closer than 3
 
 logger = logging.getLogger(__name__)
+
+
+class Places(Protocol):
+    """Scans (n, 3) in level frames, metres, by what they look like."""
+
+    def add(self, points: F32) -> None:
+        """Learn the next scan."""
+        ...
+
+    def nearest(self, points: F32, count: int) -> list[tuple[int, F64]]:
+        """The ``count`` most similar scans, best first, each with a ``scan_T_points`` (4, 4)."""
+        ...
+
+
+class Contexts:
+    """Scan Context: similar contexts and the turn between them."""
+
+    def __init__(self) -> None:
+        self._known: list[F64] = []
+
+    def add(self, points: F32) -> None:
+        self._known.append(scan_context(points))
+
+    def nearest(self, points: F32, count: int) -> list[tuple[int, F64]]:
+        found = nearest_contexts(scan_context(points), self._known, count)
+        return [(number, yaw_transform(yaw)) for number, yaw in found]
+
+
+class DensityMaps:
+    """MapClosures: matches of ORB features of density maps, seen from above.
+
+    The library puts what it searches for into its database; such scans are left out of answers. Its
+    own normals of thinned points may turn the ground upside down: it gets normals that point up.
+    """
+
+    def __init__(self) -> None:
+        library = importlib.import_module("map_closures.map_closures")
+        self._closures = library.MapClosures()
+        self._count = 0
+        self._asked = 0
+
+    def add(self, points: F32) -> None:
+        self._closures.get_closures(APART * self._count, *_with_normals(points))
+        self._count += 1
+
+    def nearest(self, points: F32, count: int) -> list[tuple[int, F64]]:
+        self._asked += 1
+        found = self._closures.get_closures(
+            APART * (self._count + self._asked), *_with_normals(points)
+        )
+        known = [c for c in found if c.source_id < APART * self._count]
+        known.sort(key=lambda c: -c.number_of_inliers)
+        # its pose leads from the scan to the points
+        return [(c.source_id // APART, inverse(np.asarray(c.pose))) for c in known[:count]]
+
+
+def _with_normals(points: F32) -> tuple[F64, F64, F64]:
+    """Points (n, 3), and some of them (m, 3) with unit normals (m, 3) that point up."""
+    centre = points[thin(points, NORMAL_CELL)].astype(np.float64)
+    normal = shape(centre, NORMAL_NEIGHBOURS).normal.astype(np.float64)
+    return points.astype(np.float64), centre, normal * np.where(normal[:, 2:] < 0, -1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,22 +116,30 @@ class _Scan:
 
 
 class ScanSystem:
-    """The ``candidates`` best places of Scan Context, each registered.
+    """The ``candidates`` most similar of the ``places``, each registered.
 
     Scans of the database lie in files in ``folder`` as long as it is used.
     """
 
-    def __init__(self, name: str, register: Register, candidates: int, folder: Path) -> None:
+    def __init__(
+        self,
+        name: str,
+        places: Callable[[], Places],
+        register: Register,
+        candidates: int,
+        folder: Path,
+    ) -> None:
         self.name = name
+        self._make_places = places
+        self._places = places()
         self._register = register
         self._candidates = candidates
         self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._scans: list[_Scan] = []
-        self._contexts: list[F64] = []
 
     def fit(self, database: Sequence[View]) -> None:
         self._scans = []
-        self._contexts = []
+        self._places = self._make_places()
         for number in range(len(database)):
             view = database[number]
             world_T_scan = level_pose(view.world_T_base)
@@ -73,7 +147,7 @@ class ScanSystem:
             path = Path(self._folder.name) / f"{number:06d}.npy"
             np.save(path, points)
             self._scans.append(_Scan(path, world_T_scan))
-            self._contexts.append(scan_context(points))
+            self._places.add(points)
 
     def localise(self, query: Query) -> list[RankedPose]:
         points, query_T_base = level_points(query.views)
@@ -81,12 +155,10 @@ class ScanSystem:
         scan = _thinned(apply(inverse(query_T_scan), points))
         scan_T_base = inverse(query_T_scan) @ query_T_base
         found = []
-        for number, yaw in nearest_contexts(scan_context(scan), self._contexts, self._candidates):
+        for number, start in self._places.nearest(scan, self._candidates):
             stored = self._scans[number]
             pose, score = self._register(
-                np.load(stored.path).astype(np.float64),
-                scan.astype(np.float64),
-                yaw_transform(yaw),
+                np.load(stored.path).astype(np.float64), scan.astype(np.float64), start
             )
             if score > 0:
                 found.append(RankedPose(stored.world_T_scan @ pose @ scan_T_base, score))
@@ -162,9 +234,14 @@ def kiss_matcher() -> Register:
 
 def make_scan_context(options: SystemOptions) -> ScanSystem:
     """Scan Context and generalised ICP."""
-    return ScanSystem("scan-context", gicp(), GICP_CANDIDATES, options.folder)
+    return ScanSystem("scan-context", Contexts, gicp(), GICP_CANDIDATES, options.folder)
 
 
 def make_kiss_matcher(options: SystemOptions) -> ScanSystem:
     """Scan Context and KISS-Matcher."""
-    return ScanSystem("kiss-matcher", kiss_matcher(), KISS_CANDIDATES, options.folder)
+    return ScanSystem("kiss-matcher", Contexts, kiss_matcher(), KISS_CANDIDATES, options.folder)
+
+
+def make_map_closures(options: SystemOptions) -> ScanSystem:
+    """MapClosures and generalised ICP."""
+    return ScanSystem("map-closures", DensityMaps, gicp(), GICP_CANDIDATES, options.folder)

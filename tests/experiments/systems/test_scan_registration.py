@@ -7,15 +7,24 @@ import numpy as np
 import pytest
 
 from semloc_logs.experiments.systems.scan_registration import (
+    Contexts,
+    DensityMaps,
     ScanSystem,
     fit_on_points,
     gicp,
     kiss_matcher,
     level_pose,
     make_kiss_matcher,
+    make_map_closures,
     make_scan_context,
 )
-from semloc_logs.numerics.transforms import exp_se3, rotation_angle, yaw_transform
+from semloc_logs.numerics.transforms import (
+    apply,
+    exp_se3,
+    inverse,
+    rotation_angle,
+    yaw_transform,
+)
 
 
 def test_a_level_pose_keeps_heading_and_place() -> None:
@@ -38,13 +47,14 @@ def test_a_turned_cloud_is_registered(name: str, town: Any) -> None:
     assert rotation_angle(pose[:3, :3] @ target_T_query[:3, :3].T) < 0.01
 
 
-@pytest.mark.parametrize("make", [make_scan_context, make_kiss_matcher])
+@pytest.mark.parametrize("make", [make_scan_context, make_kiss_matcher, make_map_closures])
 @pytest.mark.parametrize("yaw", [0.1, 3.0])
 def test_a_turned_query_is_localised(
     make: Any, yaw: float, point_drive: Any, options: Any, errors: Any
 ) -> None:
-    if make is make_kiss_matcher:
-        pytest.importorskip("kiss_matcher")
+    needed = {make_kiss_matcher: "kiss_matcher", make_map_closures: "map_closures"}
+    if make in needed:
+        pytest.importorskip(needed[make])
     system = make(options)
     system.fit(point_drive.database)
     truth = yaw_transform(yaw, (20.3, 0.2, 0.0))
@@ -56,9 +66,28 @@ def test_a_turned_query_is_localised(
 
 
 def test_a_registration_that_fails_gives_no_pose(point_drive: Any, tmp_path: Path) -> None:
-    system = ScanSystem("none", lambda target, query, start: (start, 0.0), 3, tmp_path)
+    system = ScanSystem("none", Contexts, lambda target, query, start: (start, 0.0), 3, tmp_path)
     system.fit(point_drive.database[:4])
     assert system.localise(point_drive.query_at(np.eye(4))) == []
     assert any(tmp_path.glob("*/*.npy"))
     del system
     assert not any(tmp_path.iterdir())
+
+
+def test_density_maps_find_the_scan_and_the_turn_but_none_of_the_queries(town: Any) -> None:
+    pytest.importorskip("map_closures")
+    places = DensityMaps()
+    scans = [
+        town.view(yaw_transform(0.0, (x, 0.0, 0.0)), 0, False).points for x in (0.0, 15.0, 30.0)
+    ]
+    for scan in scans:
+        places.add(scan)
+    scan_T_points = yaw_transform(1.2, (0.5, -0.4, 0.0))
+    turned = apply(inverse(scan_T_points), scans[1]).astype(np.float32)
+    for _ in range(3):  # the library knows the first query when it is asked again
+        (number, found), *_ = places.nearest(turned, 2)
+        assert number == 1
+        off = inverse(scan_T_points) @ found
+        assert np.linalg.norm(off[:2, 3]) < 1.0  # two cells of the map
+        assert rotation_angle(off[:3, :3]) < 0.05
+    assert all(number < 3 for number, _ in places.nearest(turned, 20))
