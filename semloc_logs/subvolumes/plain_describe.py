@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -37,32 +38,39 @@ def load_plain_encoder(variant: str, weights: Path | None = None) -> PlainEncode
 
 
 @njit(cache=True, nogil=True)
-def _occupied_sums(state: U8, stride: int) -> NDArray[np.int32]:
-    """Occupied voxels in each 32^3 window, every ``stride`` voxels."""
+def _occupied_counts(state: U8, edge: int) -> I64:
+    """Occupied voxels in each cube of ``edge`` voxels; what is left over at the end is not counted."""
     nx, ny, nz = state.shape
-    sums = np.zeros((nx + 1, ny + 1, nz + 1), np.int32)
-    for x in range(nx):
-        for y in range(ny):
-            row = 0
-            for z in range(nz):
-                row += (state[x, y, z] != FREE_STATE) & (state[x, y, z] != UNOBSERVED_STATE)
-                sums[x + 1, y + 1, z + 1] = (
-                    row + sums[x, y + 1, z + 1] + sums[x + 1, y, z + 1] - sums[x, y, z + 1]
-                )
-    out = np.zeros(
-        ((nx - SIZE) // stride + 1, (ny - SIZE) // stride + 1, (nz - SIZE) // stride + 1), np.int32
-    )
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
+    out = np.zeros((nx // edge, ny // edge, nz // edge), np.int64)
+    for x in range(out.shape[0] * edge):
+        for y in range(out.shape[1] * edge):
+            column = state[x, y]
             for k in range(out.shape[2]):
-                a = i * stride
-                b = j * stride
-                c = k * stride
-                for dx in range(2):
-                    for dy in range(2):
-                        for dz in range(2):
-                            sign = 1 if (dx + dy + dz) % 2 == 1 else -1
-                            out[i, j, k] += sign * sums[a + dx * SIZE, b + dy * SIZE, c + dz * SIZE]
+                count = np.uint32(0)
+                for z in range(k * edge, (k + 1) * edge):
+                    count += (column[z] != FREE_STATE) & (column[z] != UNOBSERVED_STATE)
+                out[x // edge, y // edge, k] += count
+    return out
+
+
+def _occupied_sums(state: U8, stride: int) -> I64:
+    """Occupied voxels in each 32^3 window, every ``stride`` voxels."""
+    edge = math.gcd(stride, SIZE)
+    sums = np.pad(_occupied_counts(state, edge), ((1, 0),) * 3)
+    for axis, length in enumerate(state.shape):
+        sums = sums.cumsum(axis)
+        starts = np.arange(0, length - SIZE + 1, stride) // edge
+        sums = sums.take(starts + SIZE // edge, axis) - sums.take(starts, axis)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _looked_up(state: U8, table: U8) -> U8:
+    """``table[state]``, four times as fast."""
+    out = np.empty(state.shape, np.uint8)
+    flat = out.ravel()
+    for k, value in enumerate(state.ravel()):
+        flat[k] = table[value]
     return out
 
 
@@ -79,7 +87,7 @@ def occupied_windows(state: U8, low: NDArray[np.integer], stride: int, least: in
 @torch.inference_mode()
 def describe_windows(state: U8, corners: I64, encoder: PlainEncoder) -> F32:
     """Descriptors mu (n, latent) of the windows of ``state`` at ``corners`` (n, 3) in it."""
-    codes = code_table(encoder.variant)[state]
+    codes = _looked_up(state, code_table(encoder.variant))
     out = np.zeros((len(corners), encoder.latent), np.float32)
     # the first block pools two voxels along each axis
     odd = corners % 2

@@ -59,60 +59,109 @@ def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None
     of each cell that has the maximum, or the uniform code of its neighbourhood plus ``UNIFORM``.
     Neighbourhoods are nearly uniform: only the differences from free or unobserved space are added.
     """
-    differences, of_uniform = _from_uniform(table, bias)
-    total = np.empty((2, 2, 2, FIRST), np.float32)
+    rows, of_uniform = _from_uniform(table, bias)
+    of_space = np.maximum(of_uniform, np.float32(0))
+    free = np.uint8(table.shape[1] - 4)
+    unobserved = np.uint8(table.shape[1] - 3)
+    length = codes.shape[3]
+    not_free = np.empty(length, np.uint8)
+    not_unobserved = np.empty(length, np.uint8)
+    heights = np.empty(out.shape[3], np.int64)
+    total = np.empty(8 * FIRST, np.float32)
+    cell = np.empty(64, np.uint8)
     for b in range(out.shape[0]):
         for x in range(out.shape[1]):
             for y in range(out.shape[2]):
+                # of the columns that cells here look at, which heights have another code
+                not_free[:] = 0
+                not_unobserved[:] = 0
+                for i in range(4):
+                    for j in range(4):
+                        column = codes[b, 2 * x + i, 2 * y + j]
+                        for k in range(length):
+                            not_free[k] |= column[k] ^ free
+                            not_unobserved[k] |= column[k] ^ unobserved
+                mixed = 0
                 for z in range(out.shape[3]):
-                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
-                    _pooled(
-                        cell, differences, of_uniform, total, out[b, x, y, z], largest[b, x, y, z]
-                    )
+                    is_free = _none(not_free, 2 * z)
+                    if is_free or _none(not_unobserved, 2 * z):
+                        u = 1 - int(is_free)
+                        for c in range(FIRST):
+                            out[b, x, y, z, c] = of_space[u, c]
+                        for c in range(FIRST):
+                            largest[b, x, y, z, c] = UNIFORM + u
+                    else:
+                        heights[mixed] = z
+                        mixed += 1
+                for z in heights[:mixed]:
+                    for i in range(4):
+                        for j in range(4):
+                            for k in range(4):
+                                cell[(i * 4 + j) * 4 + k] = codes[
+                                    b, 2 * x + i, 2 * y + j, 2 * z + k
+                                ]
+                    _pooled(cell, rows, of_uniform, total, out[b, x, y, z], largest[b, x, y, z])
+
+
+@njit(cache=True, nogil=True)
+def _none(found: U8, first: int) -> bool:
+    """Whether four bytes are zero."""
+    return not (found[first] | found[first + 1] | found[first + 2] | found[first + 3])
 
 
 @njit(cache=True, nogil=True)
 def _from_uniform(table: F32, bias: F32) -> tuple[F32, F32]:
-    """What the rows of ``table`` differ by from free and from unobserved space (2, 27, codes,
-    FIRST), and the values (2, FIRST) in such space.
+    """What each voxel of a neighbourhood adds to the eight in its middle where it is not free, or
+    not unobserved, (2, 64, codes, 8 * FIRST), and the values (2, FIRST) in such space.
     """
     free = table.shape[1] - 4
-    differences = np.empty((2, *table.shape), np.float32)
+    rows = np.zeros((2, 64, table.shape[1], 8 * FIRST), np.float32)
     of_uniform = np.empty((2, FIRST), np.float32)
     for u in range(2):
         of_uniform[u] = bias
         for tap in range(27):
             of_uniform[u] += table[tap, free + u]
-            differences[u, tap] = table[tap] - table[tap, free + u]
-    return differences, of_uniform
+            difference = table[tap] - table[tap, free + u]
+            for voxel in range(8):
+                i = (voxel >> 2) + tap // 9
+                j = ((voxel >> 1) & 1) + tap // 3 % 3
+                k = (voxel & 1) + tap % 3
+                into = rows[u, (i * 4 + j) * 4 + k]
+                into[:, voxel * FIRST : (voxel + 1) * FIRST] = difference
+    return rows, of_uniform
 
 
 @njit(cache=True, nogil=True)
-def _pooled(cell: U8, differences: F32, of_uniform: F32, total: F32, best: F32, which: U8) -> None:
-    """The maxima ``best`` (FIRST,) of the eight voxels in the middle of ``cell`` (4, 4, 4), and
-    ``which`` have them; ``total`` (2, 2, 2, FIRST) is working memory.
+def _pooled(cell: U8, rows: F32, of_uniform: F32, total: F32, best: F32, which: U8) -> None:
+    """The maxima ``best`` (FIRST,) of the eight voxels in the middle of ``cell``, 4 x 4 x 4 of
+    them, and ``which`` have them; ``total`` (8 * FIRST,) is working memory.
     """
-    free = differences.shape[2] - 4
+    free = rows.shape[2] - 4
     count_free = 0
     count_unobserved = 0
-    for i in range(4):
-        for j in range(4):
-            for k in range(4):
-                count_free += cell[i, j, k] == free
-                count_unobserved += cell[i, j, k] == free + 1
+    for at in range(64):
+        count_free += cell[at] == free
+        count_unobserved += cell[at] == free + 1
     u = int(count_unobserved > count_free)
     if max(count_free, count_unobserved) == 64:
         for c in range(FIRST):
             best[c] = max(of_uniform[u, c], np.float32(0))
             which[c] = UNIFORM + u
         return
-    total[:] = of_uniform[u]
-    _add_differences(cell, free + u, differences[u], total)
+    for voxel in range(8):
+        for c in range(FIRST):
+            total[voxel * FIRST + c] = of_uniform[u, c]
+    for at in range(64):
+        if cell[at] != free + u:
+            row = rows[u, at, cell[at]]
+            for n in range(8 * FIRST):
+                total[n] += row[n]
     for c in range(FIRST):
         best[c] = np.float32(0)
         which[c] = 0
-        for voxel in range(8):
-            value = total[voxel >> 2, (voxel >> 1) & 1, voxel & 1, c]
+    for voxel in range(8):
+        for c in range(FIRST):
+            value = total[voxel * FIRST + c]
             if value > best[c]:
                 best[c] = value
                 which[c] = voxel
@@ -129,9 +178,9 @@ def window_blocks(box: BoxArrays, corners: NDArray[np.int64], filters: Filters, 
     """
     codes, features, largest = box
     table, bias, of_space = filters
-    differences, of_uniform = _from_uniform(table, bias)
-    total = np.empty((2, 2, 2, FIRST), np.float32)
-    cell = np.empty((4, 4, 4), np.uint8)
+    rows, of_uniform = _from_uniform(table, bias)
+    total = np.empty(8 * FIRST, np.float32)
+    cell = np.empty(64, np.uint8)
     which = np.empty(FIRST, np.uint8)
     last = SIZE // 2 - 1
     for n in range(len(corners)):
@@ -153,13 +202,13 @@ def window_blocks(box: BoxArrays, corners: NDArray[np.int64], filters: Filters, 
                             value[c] = of_space[largest[i, j, k, 0] - UNIFORM, x, y, z, c]
                     else:
                         _inside(codes, (i, j, k), (x, y, z), cell, table.shape[1] - 1)
-                        _pooled(cell, differences, of_uniform, total, value, which)
+                        _pooled(cell, rows, of_uniform, total, value, which)
 
 
 @njit(cache=True, nogil=True)
 def _inside(codes: U8, at: Place, within: Place, cell: U8, margin: int) -> None:
-    """The codes about the cell ``at`` of a box in ``cell`` (4, 4, 4), those beyond the faces of the
-    window in which it is the cell ``within`` as ``margin``.
+    """The codes about the cell ``at`` of a box in ``cell``, 4 x 4 x 4 of them, those beyond the
+    faces of the window in which it is the cell ``within`` as ``margin``.
     """
     for a in range(4):
         for b in range(4):
@@ -167,27 +216,10 @@ def _inside(codes: U8, at: Place, within: Place, cell: U8, margin: int) -> None:
                 x = 2 * within[0] + a - 1
                 y = 2 * within[1] + b - 1
                 z = 2 * within[2] + c - 1
-                cell[a, b, c] = margin
+                code = margin
                 if 0 <= x < SIZE and 0 <= y < SIZE and 0 <= z < SIZE:
-                    cell[a, b, c] = codes[2 * at[0] + a, 2 * at[1] + b, 2 * at[2] + c]
-
-
-@njit(cache=True, nogil=True)
-def _add_differences(cell: U8, uniform: int, difference: F32, total: F32) -> None:
-    """Add to ``total`` (2, 2, 2, FIRST) what the codes (4, 4, 4) around them differ by."""
-    for i in range(4):
-        for j in range(4):
-            for k in range(4):
-                code = cell[i, j, k]
-                if code == uniform:
-                    continue
-                for a in range(max(0, i - 2), min(1, i) + 1):
-                    for b in range(max(0, j - 2), min(1, j) + 1):
-                        for c in range(max(0, k - 2), min(1, k) + 1):
-                            row = difference[((i - a) * 3 + j - b) * 3 + k - c, code]
-                            into = total[a, b, c]
-                            for n in range(FIRST):
-                                into[n] += row[n]
+                    code = codes[2 * at[0] + a, 2 * at[1] + b, 2 * at[2] + c]
+                cell[(a * 4 + b) * 4 + c] = code
 
 
 @njit(cache=True, nogil=True)

@@ -122,3 +122,20 @@ def test_shipped_weights_and_words_go_together_and_state_their_samples(variant: 
         samples = int(handle.metadata()["samples"])
     text = page.read_text(encoding="utf-8").replace(" subvolumes", "")
     assert f"{samples:,} ({variant})" in text
+
+
+@pytest.mark.parametrize("stride", [4, 8, 12, 16])
+def test_windows_are_counted_as_one_by_one(stride: int) -> None:
+    rng = np.random.default_rng(3)
+    state = np.where(rng.random((77, 58, 41)) < 3e-4, 7, FREE_STATE).astype(np.uint8)
+    state[rng.random(state.shape) < 0.3] = UNOBSERVED_STATE
+    expected = [
+        (x, y, z)
+        for x in range(0, 77 - SIZE + 1, stride)
+        for y in range(0, 58 - SIZE + 1, stride)
+        for z in range(0, 41 - SIZE + 1, stride)
+        if (state[x : x + SIZE, y : y + SIZE, z : z + SIZE] == 7).sum() >= 6
+    ]
+    assert 0 < len(expected) < len(range(0, 46, stride)) * len(range(0, 27, stride)) * 3
+    found = occupied_windows(state, np.array([32, 0, -32]), stride, 6)
+    np.testing.assert_array_equal(found - [32, 0, -32], expected)
