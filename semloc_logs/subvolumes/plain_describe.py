@@ -39,7 +39,7 @@ def load_plain_encoder(variant: str, weights: Path | None = None) -> PlainEncode
 
 @njit(cache=True, nogil=True)
 def _occupied_counts(state: U8, edge: int) -> I64:
-    """Occupied voxels in each cube of ``edge`` voxels; what is left over at the end is not counted."""
+    """Occupied voxels in each whole cube of ``edge`` voxels."""
     nx, ny, nz = state.shape
     out = np.zeros((nx // edge, ny // edge, nz // edge), np.int64)
     for x in range(out.shape[0] * edge):
