@@ -2,7 +2,9 @@
 
 A query is localised by itself in these experiments, so no row has the votes of neighbours; their
 gain is in the acceptance, which ``semloc benchmark localisation`` measures. Rows whose network was
-trained otherwise need its weights and vocabulary (:func:`training_command`).
+trained otherwise need its weights and vocabulary (:func:`training_command`). Layers that do not
+turn with their input have no row: the stages describe a map once for all quarter turns, which such a
+network cannot do (``benchmarks/ablation.py`` compares networks by themselves).
 """
 
 from __future__ import annotations
@@ -170,7 +172,10 @@ def ablated(
         }
         missing = [str(path) for path in files.values() if not path.exists()]
         if missing:
-            raise SettingsError(f"'{name}' needs {missing[0]}: {training_command(name, folder)}")
+            raise SettingsError(
+                f"its network is not trained, {missing[0]} is missing:"
+                f" {training_command(name, folder)}"
+            )
         changes |= files
     chosen = with_settings(settings or Settings().resolved(), changes)
     return _Ablated(name, chosen, work, row)
