@@ -2,7 +2,8 @@
 KISS-SLAM does, here by generalised ICP.
 
 Every query is put into its database too: what it finds among them is left out. The score is the
-number of inliers. Needs map-closures, small-gicp and numpy.
+number of inliers. It gets normals that point up: those it makes of a thinned cloud turn the ground
+over. Needs map-closures, small-gicp and numpy.
 """
 
 import sys
@@ -17,6 +18,7 @@ from local_maps import run
 
 APART = 10  # of ids: neighbours closer than 3 would not be compared
 REFINED = 3
+NORMAL_CELL = 1.0  # m: of the points whose normals it gets
 
 
 def prepare(cloud):
@@ -25,19 +27,28 @@ def prepare(cloud):
     )
 
 
+def with_normals(cloud):
+    """The cloud, and some of its points with normals that point up."""
+    part, _ = small_gicp.preprocess_points(
+        cloud, downsampling_resolution=NORMAL_CELL, num_neighbors=20, num_threads=1
+    )
+    normals = part.normals()[:, :3]
+    return cloud, part.points()[:, :3], normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+
+
 class Database:
     def __init__(self, clouds):
         self.closer = MapClosures()
         self.parts = []
         for k, cloud in enumerate(clouds):
-            self.closer.get_best_closure(APART * k, cloud)
+            self.closer.get_best_closure(APART * k, *with_normals(cloud))
             self.parts.append(prepare(cloud))
         self.next = APART * (len(self.parts) + 1)
 
     def answer(self, cloud, _):
         found = [
             c
-            for c in self.closer.get_closures(self.next, cloud)
+            for c in self.closer.get_closures(self.next, *with_normals(cloud))
             if c.source_id < APART * len(self.parts)
         ]
         self.next += APART
