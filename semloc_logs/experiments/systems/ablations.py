@@ -3,8 +3,8 @@
 A query is localised by itself in these experiments, so no row has the votes of neighbours; their
 gain is in the acceptance, which ``semloc benchmark localisation`` measures. Rows whose network was
 trained otherwise need its weights and vocabulary (:func:`training_command`). Layers that do not
-turn with their input have no row: the stages describe a map once for all quarter turns, which such a
-network cannot do (``benchmarks/ablation.py`` compares networks by themselves).
+turn with their input have no row: the stages describe a map once for all quarter turns, which such
+a network cannot do (``benchmarks/ablation.py`` compares networks by themselves).
 """
 
 from __future__ import annotations
