@@ -84,7 +84,7 @@ def test_density_maps_find_the_scan_and_the_turn_but_none_of_the_queries(town: A
         places.add(scan)
     scan_T_points = yaw_transform(1.2, (0.5, -0.4, 0.0))
     turned = apply(inverse(scan_T_points), scans[1]).astype(np.float32)
-    for _ in range(3):  # the library knows the first query when it is asked again
+    for _ in range(3):  # the library knows the first query by the second time
         (number, found), *_ = places.nearest(turned, 2)
         assert number == 1
         off = inverse(scan_T_points) @ found
