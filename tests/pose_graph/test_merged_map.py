@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.optimise import merge_maps, optimise
@@ -92,3 +93,19 @@ def test_a_car_that_left_and_a_wall_that_was_built_are_changes(drives: Any, squa
     built = found[own((50, 10, 4))]
     assert (built["label"], built["change"]) == (WALL, "appeared")
     assert (built["occupied_session"], built["free_session"]) == ("june", "may")
+
+
+def test_voxels_of_two_sizes_do_not_make_one_map(drives: Any, square_of: Any) -> None:
+    for name in ("a", "b", "c"):
+        drives.add(name, square_of(1), 0.0, 1.0)
+        _write_submap(drives, name, {(5, 20, 2): WALL})
+    path = drives.work.session("b").session_json
+    write_json(path, read_json(path) | {"voxel_size": 0.1})
+    drives.close([("c", 0, "a", 0, None)])
+    optimise(drives.work, load().resolved())
+    merged = merge_maps(drives.work)  # b has a frame of its own
+    assert [one.frame for one in merged] == ["a", "b"]
+    drives.close([("b", 0, "a", 0, None)])
+    optimise(drives.work, load().resolved())
+    with pytest.raises(WorkspaceError, match=r"voxels of 0\.1, 0\.3 m"):
+        merge_maps(drives.work)

@@ -1,5 +1,6 @@
 """Drives around a block in one frame: known drift in, true poses out."""
 
+import shutil
 import sys
 from typing import Any
 
@@ -11,7 +12,7 @@ from semloc_logs.evaluation.trajectory_errors import trajectory_errors
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.optimise import optimise
-from semloc_logs.tables.table import read_metadata, read_table
+from semloc_logs.tables.table import read_json, read_metadata, read_table, write_json, write_table
 from semloc_logs.voxels.store import poses_of
 
 pytest.importorskip("gtsam")
@@ -106,6 +107,79 @@ def test_only_sessions_whose_closures_changed_are_solved_again(drives: Any, squa
     drives.close([*first, *second])
     optimise(drives.work, SETTINGS)
     assert [path.read_bytes() for path in files] == before  # as in one go
+
+
+def test_all_that_the_poses_depend_on_makes_them_again(drives: Any, square_of: Any) -> None:
+    drives.add("a", square_of(1), 0.0, 1.0)
+    drives.add("b", square_of(1), 0.0, 1.0)
+    drives.close([("b", k, "a", k, None) for k in range(20, 400, 40)])
+    both = ["a", "b"]
+
+    def again(settings: Any = SETTINGS, **options: bool) -> list[str]:
+        """What is solved now, after which nothing is left to do."""
+        solved = optimise(drives.work, settings, **options).solved
+        assert optimise(drives.work, settings, **(options | {"overwrite": False})).solved == []
+        return list(solved)
+
+    assert again() == both
+    assert again() == []
+    assert again(overwrite=True) == both
+    assert again(covariances=True) == both
+    other = load(assignments={"optimize.odometry_drift": "0.02"}).resolved()
+    assert again(other) == both
+    path = drives.work.session("b").session_json
+    write_json(path, read_json(path) | {"fingerprint": "of another map"})
+    assert again(other) == both
+    drives.work.optimized_trajectory("b").unlink()
+    assert again(other) == both
+    # a trajectory of another time, as after a run that was killed
+    earlier = drives.work.optimized_trajectory("b").read_bytes()
+    assert again() == both
+    drives.work.optimized_trajectory("b").write_bytes(earlier)
+    assert again() == both
+
+
+def test_closures_of_two_groups_stay_in_the_order_of_their_table(
+    drives: Any, square_of: Any
+) -> None:
+    """The second ones of a and b are between those of c and d."""
+    for name in ("a", "b", "c", "d"):
+        drives.add(name, square_of(1), 0.0, 1.0)
+    drives.close([(q, k, t, k, None) for k in (20, 200) for q, t in (("d", "c"), ("b", "a"))])
+    report = optimise(drives.work, SETTINGS)
+    assert (report.frames, report.rejected) == (2, 0)
+    ends = ("query_session", "query_stamp_ns")
+    expected, found = (
+        [[row[end] for end in ends] for row in read_table(path).to_pylist()]
+        for path in (drives.work.closures, drives.work.graph_closures)
+    )
+    assert [session for session, _ in found] == ["d", "b", "d", "b"]
+    assert found == expected
+
+
+def test_a_session_that_was_removed_leaves_nothing(drives: Any, square_of: Any) -> None:
+    """Its closures are passed over, and its poses go."""
+    for name in ("a", "b", "c"):
+        drives.add(name, square_of(1), 0.0, 1.0)
+    matches = [("b", 20, "a", 20, None), ("c", 30, "a", 30, None), ("a", 40, "c", 40, None)]
+    drives.close(matches)
+    assert optimise(drives.work, SETTINGS).closures == 3
+    shutil.rmtree(drives.work.session("c").path)
+    report = optimise(drives.work, SETTINGS)
+    assert (report.sessions, report.closures, report.frames) == (2, 1, 1)
+    trajectories = sorted(path.stem for path in drives.work.optimized.glob("*.parquet"))
+    assert trajectories == ["a", "b"]
+
+
+def test_without_any_closure_each_drive_has_its_own_frame(drives: Any, square_of: Any) -> None:
+    drives.add("b", square_of(1), 0.0, 1.0)
+    drives.add("a", square_of(1), 0.0, 1.0)
+    drives.close([("b", 20, "a", 20, None)])
+    table = read_table(drives.work.closures)
+    write_table(drives.work.closures, table.slice(0, 0), read_metadata(drives.work.closures))
+    report = optimise(drives.work, SETTINGS)
+    assert (report.closures, report.rejected, report.frames) == (0, 0, 2)
+    assert report.solved == ["a", "b"]
 
 
 def test_the_graph_is_read_by_gtsam_with_the_same_poses(drives: Any, square_of: Any) -> None:
