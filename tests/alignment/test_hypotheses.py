@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool
+from semloc_logs.alignment.hypotheses import (
+    Hypothesis,
+    keep_best_submaps,
+    non_maximum_suppression,
+    pool,
+)
 
 
 def slow_pool(
@@ -85,11 +90,34 @@ def test_matches_of_other_submaps_and_headings_do_not_add_up() -> None:
     assert pool(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0), 1.0, 5) == []
 
 
+def test_a_pose_beside_a_better_one_is_left_out() -> None:
+    """Within 0.5 m along each axis and 0.05 rad, in the same submap; headings go round."""
+    best = (3.13, 1.0, 2.0, 3.0)
+    poses = [
+        best,
+        (3.13 + 0.04, 1.4, 1.6, 3.4),
+        (3.13 + 0.04 - 2 * np.pi, 1.0, 2.0, 3.0),
+        (3.13 + 0.06, 1.0, 2.0, 3.0),
+        (3.13, 1.6, 2.0, 3.0),
+        (3.13, 1.0, 1.4, 3.0),
+        (3.13, 1.0, 2.0, 3.6),
+        best,
+    ]
+    groups = np.array([4, 4, 4, 4, 4, 4, 4, 5])
+    kept = non_maximum_suppression(groups, np.array(poses), 0.5, 9)
+    assert kept.tolist() == [0, 3, 4, 5, 6, 7]
+    assert non_maximum_suppression(groups, np.array(poses), 0.5, 2).tolist() == [0, 3]
+
+
 def test_the_submaps_with_the_heaviest_hypotheses_are_looked_into() -> None:
     found = [
         Hypothesis(group, (0.0, float(k), 0.0, 0.0), 1, weight)
         for k, (group, weight) in enumerate([(7, 1.0), (2, 3.0), (7, 4.0), (5, 3.0)])
     ]
     assert [h.group for h in keep_best_submaps(found, 2)] == [7, 2, 7]
+    assert [h.group for h in keep_best_submaps(found[::-1], 2)] == [7, 2, 7]
+    # not those with the most of them
+    many = [Hypothesis(8, (0.0, float(k), 0.0, 0.0), 1, 2.0) for k in range(3)]
+    assert [h.group for h in keep_best_submaps([*many, found[1]], 1)] == [2]
     assert keep_best_submaps(found, 9) == found
     assert keep_best_submaps([], 3) == []

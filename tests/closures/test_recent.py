@@ -18,6 +18,12 @@ class Slotted:
     name: str = "a"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Named:
+    name: str
+    numbers: np.ndarray
+
+
 @dataclass(eq=False)
 class Growing:
     numbers: np.ndarray
@@ -41,6 +47,7 @@ def eight(count: int) -> np.ndarray:
         ((eight(1), [eight(2), 7], None), 24),
         ({"a": eight(1), "b": "text"}, 8),
         (Slotted(eight(6)), 48),
+        (Named("a", eight(6)), 48),
         (Growing(eight(2)), 16),
     ],
 )
@@ -70,15 +77,15 @@ class Counted:
 
 
 def test_the_values_used_longest_ago_are_forgotten_when_the_bytes_are_spent() -> None:
-    cache = Counted(40)
-    for key in "aabab":
+    cache = Counted(32)
+    for key in "aababa":
         cache.get(key, 2)
-    assert cache.made == ["a", "b"]
-    cache.get("c", 2)  # 48 bytes: a was used longest ago
-    cache.get("b", 2)
-    assert cache.made == ["a", "b", "c"]
+    assert cache.made == ["a", "b"]  # 32 bytes
+    cache.get("c", 2)  # 48 bytes: b was used longest ago, though it was made last
     cache.get("a", 2)
-    assert cache.made == ["a", "b", "c", "a"]
+    assert cache.made == ["a", "b", "c"]
+    cache.get("b", 2)
+    assert cache.made == ["a", "b", "c", "b"]
 
 
 def test_a_large_value_pushes_out_several_and_stays_alone() -> None:
