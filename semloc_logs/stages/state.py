@@ -65,7 +65,7 @@ def read_kept(work: Workspace) -> Settings | None:
         return None
     try:
         return validated(read_json(work.settings)["given"])
-    except (SettingsError, KeyError, TypeError):
+    except (SettingsError, KeyError):
         raise WorkspaceError(
             f"{work.settings} is of another version of semloc: use that version, or delete the"
             " file and give the settings again."

@@ -40,6 +40,11 @@ def test_later_commands_take_them(tmp_path: Path) -> None:
     settled = settle(work, given(training__seed="3")).resolved()
     assert (settled.fusion.voxel_size, settled.labels.source) == (0.05, "geometry")
     assert settled.training.seed == 3
+    assert set(settle(work, given(training__seed="3")).given()) == {
+        "fusion.voxel_size",
+        "labels.source",
+        "training.seed",
+    }
     assert settled.fusion.max_range == pytest.approx(50 * 0.05 / 0.30)
 
 
@@ -59,8 +64,9 @@ def test_a_contradiction_is_refused_with_both_values(
 ) -> None:
     work = kept(tmp_path, **ROOM, **{"labels.source": "geometry"})
     contradicting = load(assignments={key: after})
-    for writes in (False, True):
-        with pytest.raises(SettingsError, match=f"{key}={before}, and {key}={after} is given"):
+    for writes, remedy in ((False, "as its tables have it"), (True, "or add --overwrite")):
+        sentence = f"{key}={before}, and {key}={after} is given: leave it out, {remedy}"
+        with pytest.raises(SettingsError, match=sentence):
             settle(work, contradicting, writes=writes)
     settled = settle(work, contradicting, writes=True, overwrite=True)
     section, name = key.split(".")
@@ -116,8 +122,10 @@ def test_what_changes_no_table_is_free(tmp_path: Path, key: str) -> None:
     for writes in (False, True):
         settle(work, load(assignments={key: value}), writes=writes)
     content = work.settings.read_bytes()
+    file = work.settings.stat().st_ino
     keep(work, load(assignments={key: value}).resolved())
     assert work.settings.read_bytes() == content
+    assert work.settings.stat().st_ino == file, "it is not written again"
 
 
 def test_a_stage_may_choose_the_probability_and_a_reader_may_not(tmp_path: Path) -> None:
@@ -151,6 +159,10 @@ def test_a_file_of_another_version_is_named(tmp_path: Path) -> None:
     write_json(work.settings, {"given": {"fusion": {"gone": 1}}})
     with pytest.raises(WorkspaceError, match=r"workspace\.json is of another version"):
         read_kept(work)
+    for content in ({}, {"given": None}, {"given": ["fusion"]}):
+        write_json(work.settings, content)
+        with pytest.raises(WorkspaceError, match=r"workspace\.json is of another version"):
+            read_kept(work)
 
 
 def test_every_stage_writes_them_down(
