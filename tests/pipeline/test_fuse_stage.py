@@ -3,6 +3,7 @@ interruption.
 """
 
 import json
+import logging
 import os
 import shutil
 from collections.abc import Callable
@@ -25,7 +26,9 @@ from semloc_logs.errors import (
     WorkspaceError,
 )
 from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
+from semloc_logs.logs.poses.mountings import Mountings, StaticTransform
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
@@ -540,3 +543,128 @@ def test_memory_is_not_a_setting_of_a_session() -> None:
     settings = load(assignments={"logs.memory": str(1 << 28)}).resolved()
     read = fuse_stage._as_read_before(present, settings)
     assert (read.logs.up, read.logs.memory) == ("+z", 1 << 28)
+
+
+def quick_fusion(
+    monkeypatch: pytest.MonkeyPatch, problems: tuple[Problem, ...] = ()
+) -> Callable[..., Report]:
+    """Fuses sessions without reading them: one whose name begins with "bad" fails, with "topic"
+    lacks a topic.
+    """
+
+    def quick(task: FuseTask, **options: Any) -> FusedSession:
+        name = task.folder.name
+        if name.startswith("bad"):
+            raise LogError(f"{name} is no log.")
+        if name.startswith("topic"):
+            raise TopicError(f"{name} lacks a topic.")
+        counts = {"keyframes": 0, "voxels": 0, "label_source": "log"}
+        recorded = {"fingerprint": task.fingerprint, "skipped": ["no fix"], **counts}
+        write_json(task.folder.session_json, recorded)
+        return FusedSession({"logs": [], **counts}, problems)
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", quick)
+
+    def fuse(work: Workspace, *names: str, **options: Any) -> Report:
+        sessions = [log_of(work.path.parent, name) for name in names]
+        return fuse_stage.fuse(sessions, work, Settings().resolved(), Serial(), **options)
+
+    return fuse
+
+
+def test_only_logs_of_the_named_sessions_are_repaired_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repaired: list[Path] = []
+    monkeypatch.setattr(fuse_stage, "recover", repaired.append)
+    fuse = quick_fusion(monkeypatch)
+    report = fuse(Workspace(tmp_path / "work"), "a", "b", "c", names=["a", "c"])
+    assert report.done == ["a", "c"]
+    assert repaired == [tmp_path / "a.mcap", tmp_path / "c.mcap"]
+
+
+def test_what_a_log_lost_is_told_each_time_and_its_other_problems_are_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    problems = (
+        Problem("/gps", ProblemKind.POSE, "no fix", lost=True),
+        Problem("/imu", ProblemKind.GRAVITY, "up is from the IMU", lost=False),
+    )
+    fuse = quick_fusion(monkeypatch, problems)
+    work = Workspace(tmp_path / "work")
+    assert fuse(work, "a").skipped == ["no fix"]
+    assert "a: up is from the IMU" in caplog.text
+    assert "a: no fix" not in caplog.text
+    again = fuse(work, "a")
+    assert (again.kept, again.skipped) == (["a"], ["no fix"])
+
+
+def test_one_failure_is_raised_and_several_are_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    fuse = quick_fusion(monkeypatch)
+    work = Workspace(tmp_path / "work")
+    with pytest.raises(LogError, match="bad 1 is no log"):
+        fuse(work, "bad 1")
+    assert "bad 1 is no log" not in caplog.text
+    with pytest.raises(LogError, match=r"It failed before.*bad 2 is no log"):
+        fuse(work, "bad 1", "bad 2")
+    assert "bad 2 is no log" not in caplog.text  # the only one that was read
+    with pytest.raises(LogError, match="bad 3 is no log"):
+        fuse(work, "bad 3", "bad 4")
+    assert "bad 3: bad 3 is no log." in caplog.text
+    # a log that failed before is no question of topics
+    with pytest.raises(LogError) as caught:
+        fuse(work, "bad 1", "topic")
+    assert not isinstance(caught.value, TopicError)
+
+
+def test_a_log_borrows_transforms_from_those_of_other_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it borrows is an input of the session."""
+    asked: list[tuple[Any, ...]] = []
+    lent = Mountings()
+
+    def lend(paths: Any, others: Any, topics: Any, child: Any, memory: int) -> Mountings:
+        asked.append((paths, others, child))
+        return lent
+
+    monkeypatch.setattr(fuse_stage, "lent_transforms", lend)
+    a, b, c = (log_of(tmp_path, name).logs[0] for name in "abc")
+    sessions = [SessionInput("ab", (a, b)), SessionInput("c", (c,))]
+    work = Workspace(tmp_path / "work")
+
+    def planned(**given: str) -> list[str]:
+        settings = load(assignments={k.replace("__", "."): v for k, v in given.items()}).resolved()
+        return [t.fingerprint for t in fuse_stage.plan_fuse(sessions, work, settings).tasks]
+
+    first = planned()
+    assert asked == [((a, b), [c], None), ((c,), [a, b], None)]
+    asked.clear()
+    planned(fusion__odometry="lidar")
+    assert [child for _, _, child in asked] == ["base_link", "base_link"]
+    transform = StaticTransform("base_link", "lidar", (0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0))
+    lent = Mountings(lent=(transform,))
+    assert not set(planned()) & set(first)
+    write_truth(tmp_path / "poses.tum", np.array([0, 1]), np.array([np.eye(4), np.eye(4)]))
+    for frame, expected in (("imu", "imu"), ("", "base_link")):
+        asked.clear()
+        sessions = [
+            SessionInput("c", (c,), poses=TrajectoryFile(tmp_path / "poses.tum", None, frame))
+        ]
+        planned()
+        assert asked == [((c,), [], expected)]
+
+
+def test_workers_in_another_folder_find_the_log_and_the_workspace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log_of(tmp_path, "a")
+    monkeypatch.chdir(tmp_path)
+    session = SessionInput("a", (Path("a.mcap"),))
+    [task] = fuse_stage.plan_fuse([session], Workspace(Path("w")), Settings().resolved()).tasks
+    assert task.logs == (tmp_path / "a.mcap",)
+    assert task.folder.path == Workspace(tmp_path / "w").session("a").path

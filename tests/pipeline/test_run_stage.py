@@ -121,6 +121,28 @@ def test_rates_are_of_one_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     assert total.report.seconds == {"fuse": 5.0, "close": 8.0, "annotate": 1.0}
 
 
+def test_reports_of_stages_are_joined() -> None:
+    total = run_stage._Total(1)
+    total.add("fuse", Report(done=["a"], kept=["b"], skipped=["no fix"], failed=["no log"]))
+    total.add("close", Report(done=["closures"], skipped=["no fit"], closures=3))
+    report = total.report
+    assert report.done == ["fuse a", "close closures"]
+    assert report.kept == ["fuse b"]
+    assert report.skipped == ["no fix", "no fit"]
+    assert report.failed == ["no log"]
+    assert report.closures == 3
+
+
+def test_a_map_without_a_log_is_not_annotated(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(run_stage, "annotate", None)
+    monkeypatch.setattr(run_stage, "SessionMap", lambda _: SimpleNamespace(is_map=True))
+    session = SessionInput("a", (tmp_path / "a.ply",))
+    settings = Settings().resolved()
+    run_stage._annotate_logs(session, Workspace(tmp_path), settings, AnnotationMode.COPY)
+
+
 def test_several_logs_of_a_session_have_outputs_of_their_own(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
