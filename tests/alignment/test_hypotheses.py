@@ -72,6 +72,32 @@ def test_the_heaviest_are_kept() -> None:
     ]
 
 
+def test_the_best_of_both_grids_are_as_many_as_asked_for() -> None:
+    """Three matches are whole in one grid and three others in the grid that is moved."""
+    x = [0.5, 1.5, 1.6, 9.9, 10.1, 10.2]
+    t = np.column_stack([x, np.full(6, 0.5), np.full(6, 0.5)])
+    weight = np.array([10.0, 10.0, 10.0, 11.0, 11.0, 11.0])
+    [best] = pool(np.zeros(6, np.int64), np.zeros(6), t, weight, 2.0, 1)
+    assert (best.votes, best.weight) == (3, 33.0)
+    np.testing.assert_allclose(best.pose, (0.0, 30.2 / 3, 0.5, 0.5))
+
+
+def test_weights_count_more_than_votes() -> None:
+    t = np.array([[0.5, 0.5, 0.5]] * 3 + [[9.5, 0.5, 0.5]] * 2)
+    weight = np.array([1.0, 1.0, 1.0, 2.0, 2.0])
+    [best] = pool(np.zeros(5, np.int64), np.zeros(5), t, weight, 2.0, 1)
+    assert (best.votes, best.weight) == (2, 4.0)
+
+
+def test_of_equally_heavy_cells_the_first_are_kept() -> None:
+    """Every third of 2000 cells is twice as heavy."""
+    number = np.random.default_rng(0).permutation(2000)
+    t = np.column_stack([number * 2.0 + 0.5, np.full(2000, 0.5), np.full(2000, 0.5)])
+    weight = np.where(number % 3 == 1, 2.0, 1.0)
+    found = pool(np.zeros(2000, np.int64), np.zeros(2000), t, weight, 2.0, 3)
+    assert [h.pose[1] for h in found] == [2.5, 8.5, 14.5]
+
+
 def test_a_pose_at_a_cell_border_is_counted_whole() -> None:
     t = np.array([[1.99, 0.5, 0.5], [2.01, 0.5, 0.5], [1.98, 0.5, 0.5], [2.02, 0.5, 0.5]])
     found = pool(np.zeros(4, np.int64), np.zeros(4), t, np.ones(4), 2.0, 10)
