@@ -110,7 +110,8 @@ def test_without_closing_there_is_a_sentence(tmp_path: Path) -> None:
     work = Workspace(tmp_path / "work")
     write_tables(work, TablesPlan(sessions=1, closures=0, road=30))
     work.closures.unlink()
-    with pytest.raises(WorkspaceError, match="semloc close"):
+    sentence = rf"closures\.parquet does not exist: run 'semloc close -w {work.path}' first\."
+    with pytest.raises(WorkspaceError, match=sentence):
         write_report(work, Settings().resolved())
 
 
