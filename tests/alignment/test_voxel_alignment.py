@@ -130,6 +130,17 @@ def test_look_ups_of_points() -> None:
     assert look_up(grid, points).tolist() == [ANY_BIT | 2, ANY_BIT | 2, 0, FREE_BIT, 0, 0]
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_look_up_beside_the_grid_finds_nothing(axis: int) -> None:
+    """A full grid of 3 x 3 x 3 cells of 0.5 m from (-1, 2, 4) on."""
+    corner = np.array([-1.0, 2.0, 4.0])
+    grid = MaskGrid(np.full((3, 3, 3), 9, np.uint8), corner, 0.5)
+    along = [-0.6, -0.1, 0.1, 1.4, 1.6, 2.1]
+    points = np.tile(corner + 0.75, (len(along), 1))
+    points[:, axis] = corner[axis] + along
+    assert look_up(grid, points).tolist() == [0, 0, 9, 9, 0, 0]
+
+
 def slow_tau(
     query: dict[Cell, int],
     target: dict[Cell, int],
