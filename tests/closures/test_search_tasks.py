@@ -1,4 +1,4 @@
-"""Which queries of a block are searched in a target, and what a survey is asked for."""
+"""Which queries of a block are searched in a target, and what a survey gets."""
 
 from __future__ import annotations
 

@@ -555,7 +555,7 @@ def quick_fusion(
     def quick(task: FuseTask, **options: Any) -> FusedSession:
         name = task.folder.name
         if name.startswith("bad"):
-            raise LogError(f"{name} is no log.")
+            raise LogError(f"{name} cannot be read.")
         if name.startswith("topic"):
             raise TopicError(f"{name} lacks a topic.")
         counts = {"keyframes": 0, "voxels": 0, "label_source": "log"}
@@ -606,16 +606,16 @@ def test_one_failure_is_raised_and_several_are_logged(
     caplog.set_level(logging.INFO)
     fuse = quick_fusion(monkeypatch)
     work = Workspace(tmp_path / "work")
-    with pytest.raises(LogError, match="bad 1 is no log"):
+    with pytest.raises(LogError, match="bad 1 cannot be read"):
         fuse(work, "bad 1")
-    assert "bad 1 is no log" not in caplog.text
-    with pytest.raises(LogError, match=r"It failed before.*bad 2 is no log"):
+    assert "bad 1 cannot be read" not in caplog.text
+    with pytest.raises(LogError, match=r"It failed before.*bad 2 cannot be read"):
         fuse(work, "bad 1", "bad 2")
-    assert "bad 2 is no log" not in caplog.text  # the only one that was read
-    with pytest.raises(LogError, match="bad 3 is no log"):
+    assert "bad 2 cannot be read" not in caplog.text  # the only one that was read
+    with pytest.raises(LogError, match="bad 3 cannot be read"):
         fuse(work, "bad 3", "bad 4")
-    assert "bad 3: bad 3 is no log." in caplog.text
-    # a log that failed before is no question of topics
+    assert "bad 3: bad 3 cannot be read." in caplog.text
+    # with a log that failed before it is more than a missing topic
     with pytest.raises(LogError) as caught:
         fuse(work, "bad 1", "topic")
     assert not isinstance(caught.value, TopicError)

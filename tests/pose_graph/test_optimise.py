@@ -149,7 +149,7 @@ def test_all_that_the_poses_depend_on_makes_them_again(drives: Any, square_of: A
 def test_closures_of_two_groups_stay_in_the_order_of_their_table(
     drives: Any, square_of: Any
 ) -> None:
-    """The second ones of a and b are between those of c and d."""
+    """Rows of a and b, and of c and d, take turns."""
     for name in ("a", "b", "c", "d"):
         drives.add(name, square_of(1), 0.0, 1.0)
     drives.close([(q, k, t, k, None) for k in (20, 200) for q, t in (("d", "c"), ("b", "a"))])

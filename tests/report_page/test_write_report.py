@@ -108,7 +108,7 @@ def test_a_log_whose_name_is_not_unicode_is_named_as_far_as_it_goes(
     tables: Workspace, tmp_path: Path
 ) -> None:
     work = Workspace(Path(shutil.copytree(tables.path, tmp_path / "work")))
-    reason = f"{os.fsdecode(bytes([0x63, 0xE9]))}.bag is no log."  # the second byte is Latin-1
+    reason = f"{os.fsdecode(bytes([0x63, 0xE9]))}.bag cannot be read."  # the second byte is Latin-1
     write_json(work.failure("c"), {"fingerprint": "", "reason": reason})
     page = write_report(work, Settings().resolved(), slim=True)
-    assert data_of(page)["failed"] == [{"session": "c", "reason": "c?.bag is no log."}]
+    assert data_of(page)["failed"] == [{"session": "c", "reason": "c?.bag cannot be read."}]
