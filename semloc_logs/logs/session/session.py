@@ -28,7 +28,13 @@ from semloc_logs.logs.poses.navsat import NavSatPoses, navsat_poses
 from semloc_logs.logs.poses.tf_tree import Change, Edge, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile, stations_along
-from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
+from semloc_logs.logs.problems import (
+    Problem,
+    ProblemKind,
+    sentences,
+    sorted_problems,
+    without_loss_of,
+)
 from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import Roles, find_roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
@@ -106,10 +112,19 @@ class Session:
         except RoleError as error:
             raise type(error)(f"{self.name}: {error}") from error
         if not self.roles.ranging:
-            raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
+            raise RoleError(self._without_sensor())
         self._reading = reading_of(self._options.logs, self.roles, self.streams, self.name)
         self._pass = self._new_pass(ImageRelay())
         self._conclusion: list[Problem] = []
+
+    def _without_sensor(self) -> str:
+        """Why there is nothing to make clouds from; damaged parts may have held it."""
+        problems = [problem for log in self.logs for problem in log.problems]
+        damage = sentences(p for p in problems if p.kind is ProblemKind.FILE and p.lost)
+        reason = f"{self.name} holds no messages."
+        if any(stream.count for stream in self.streams):
+            reason = f"{self.name}: {no_sensor(self.streams)}"
+        return " ".join([*damage, reason])
 
     @property
     def _wants_odometry(self) -> bool:

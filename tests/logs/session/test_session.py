@@ -671,6 +671,12 @@ def test_logs_that_cannot_be_a_session() -> None:
         open_session([])
     with pytest.raises(RoleError, match="No topic is a LIDAR, depth images or a stereo pair"):
         Session([FakeLog([odometry(0.0)])])
+    with pytest.raises(RoleError, match=r"^drive\.mcap holds no messages\.$"):
+        Session([FakeLog([])])
+    damaged = FakeLog([])
+    damaged.problems.append(Problem("", ProblemKind.FILE, "drive.mcap is cut off.", lost=True))
+    with pytest.raises(RoleError, match=r"^drive\.mcap is cut off\. drive\.mcap holds no messages"):
+        Session([damaged])
     with pytest.raises(RoleError, match=r"drive.mcap: .*--topic pose=/a"):
         Session([FakeLog([sweep(0.0), odometry(0.0, topic="/a"), odometry(0.0, topic="/b")])])
 
