@@ -143,7 +143,7 @@ def _contradicting(maps: Maps, settings: Resolved) -> dict[frozenset[str], str]:
         return {}
     return {
         pair: f"Sessions {' and '.join(sorted(pair))} get no closures with each other: {text};"
-        " give the right mounting with --set logs.mountings.FRAME=[x,y,z,qx,qy,qz,qw], or search"
+        " give the right mounting with --set logs.mountings.FRAME=[x,y,z,qx,qy,qz,qw], or take"
         " them all the same with --set closures.misfits=true, as where they are of two vehicles."
         for pair, text in contradictions(maps).items()
     }

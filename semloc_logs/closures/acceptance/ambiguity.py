@@ -97,7 +97,7 @@ def ambiguity(
 def _about(places: F64, road: F64, reach: float, weights: F64 | None = None) -> F64:
     """How many of ``places`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
 
-    With ``much`` (m,) the sums of how much they show.
+    With ``weights`` (m,) the sums of these.
     """
     order = np.argsort(places, kind="stable")
     sums = np.r_[0.0, np.cumsum(np.ones(len(places)) if weights is None else weights[order])]

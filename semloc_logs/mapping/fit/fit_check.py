@@ -106,18 +106,20 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         add_evident_faults(stream, session, clouds)
         if not stream.findings:
-            _add_difference(stream, clouds, before, track.at_many)
-            before.append((topic, clouds))
+            compare(stream, clouds, before, track.at_many)
         if not stream.is_wrong:
             stream.drift = local_drift(clouds)
         check.streams.append(stream)
     return check
 
 
-def _add_difference(
-    stream: StreamFit, clouds: Clouds, before: Sequence[tuple[str, Clouds]], poses_at: PosesAt
+def compare(
+    stream: StreamFit, clouds: Clouds, before: list[tuple[str, Clouds]], poses_at: PosesAt
 ) -> None:
-    """Compares a stream that fits the poses with the ones ``before`` it, by topic."""
+    """Compares a stream that fits the poses with the ones ``before`` it, by topic.
+
+    It joins them where it agrees with all.
+    """
     for topic, others in before:
         if text := difference_text(others, clouds, poses_at):
             stream.findings.append(
@@ -128,6 +130,7 @@ def _add_difference(
                 )
             )
             return
+    before.append((stream.topic, clouds))
 
 
 def check_stream(

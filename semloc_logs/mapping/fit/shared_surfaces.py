@@ -57,6 +57,8 @@ def difference_text(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> str:
     shift = _searched(both, found)
     if shift.any():
         found = registered(both, numbers, _start(both, np.r_[shift, np.zeros(3)]))
+        if len(found.pairs) < LEAST_PAIRS:
+            return ""
     offset, sigma = _offset(found, poses_at)
     for _ in range(MOST_STARTS):
         before = offset

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.mapping.fit import fit_check
+from semloc_logs.mapping.fit.findings import StreamFit
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.fit.shared_surfaces import difference_text
 from semloc_logs.numerics.transforms import apply, exp_se3
@@ -91,3 +93,27 @@ def test_nothing_is_said_where_mountings_agree_or_nothing_shows_it(
     clouds, track = drive
     clouds = Clouds(clouds.collected, clouds.rows[:1] if "late_ns" in how else clouds.rows, 0.3)
     assert difference_text(*second_sensor(clouds, offset, **how), track.at_many) == ""  # type: ignore[arg-type]
+
+
+def test_a_stream_that_is_off_is_none_that_others_are_compared_with(
+    drive: tuple[Clouds, PoseTrack],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of three sensors the second one is refused, and the third fits the first."""
+    clouds, track = drive
+    compared: list[tuple[Clouds, Clouds]] = []
+
+    def differs(others: Clouds, own: Clouds, _: object) -> str:
+        compared.append((others, own))
+        return "off" if own is streams[1] else ""
+
+    streams = [clouds, second_sensor(clouds, np.zeros(6))[1], second_sensor(clouds, np.zeros(6))[1]]
+    monkeypatch.setattr(fit_check, "difference_text", differs)
+    before: list[tuple[str, Clouds]] = []
+    wrong = []
+    for number, own in enumerate(streams):
+        stream = StreamFit(f"/{number}")
+        fit_check.compare(stream, own, before, track.at_many)
+        wrong.append(stream.is_wrong)
+    assert wrong == [False, True, False]
+    assert [others is clouds for others, _ in compared] == [True, True]
