@@ -17,8 +17,8 @@ NORMAL_NOISE = np.radians(2.0)  # of tangent planes
 LEAST_NOISE = 0.02  # m: of plane distances
 UNKNOWN_NOISE = 1.0  # m: of a fit without points
 # of the covariance: neighbouring points share their errors, and the fewer points meet a surface the
-# more of them do so by chance. How it grows from 0 to 40 m was measured on simulated sweeps, which
-# need half of it; how large it is, on real ones
+# more of them do so by chance. How it grows from 0 to 40 m was measured on simulated sweeps, its
+# size on real ones, which need twice as much
 LEAST_INFLATION = 1.0
 INFLATION_OF_SHARE = 0.25
 LEAST_SHARE = 0.05

@@ -39,6 +39,11 @@ class Mounted:
     height: float
     voxel: float
 
+    @property
+    def mountings(self) -> dict[str, bytes]:
+        """The bytes of the mountings: equal ones are compared at once."""
+        return {frame: T.tobytes() for frame, T in self.base_T_sensors.items()}
+
     @staticmethod
     def of(session: SessionMap) -> Mounted:
         """The one of a session with keyframes."""
@@ -60,10 +65,13 @@ class Mounted:
 def contradictions(maps: Mapping[str, SessionMap]) -> dict[frozenset[str], str]:
     """The pairs of sessions that contradict each other, with the end of a sentence about them."""
     mounted = {name: Mounted.of(m) for name, m in sorted(maps.items()) if m.posed and not m.is_map}
+    mountings = {name: session.mountings for name, session in mounted.items()}
     found = {}
-    for (name, one), (other_name, other) in combinations(mounted.items(), 2):
-        if text := contradiction(one, other):
-            found[frozenset((name, other_name))] = text
+    for name, other in combinations(mounted, 2):
+        if mountings[name] == mountings[other]:  # as of most of many sessions
+            continue
+        if text := contradiction(mounted[name], mounted[other]):
+            found[frozenset((name, other))] = text
     return found
 
 
@@ -75,8 +83,6 @@ def contradiction(one: Mounted, other: Mounted) -> str:
     for frame in sorted(one.base_T_sensors.keys() & other.base_T_sensors.keys()):
         first = one.base_T_sensors[frame]
         second = other.base_T_sensors[frame]
-        if np.array_equal(first, second):  # as of most of many sessions
-            continue
         shift = first[:3, 3] - second[:3, 3]
         turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()
         if np.linalg.norm(turn) > OTHER_AXES:
@@ -84,11 +90,13 @@ def contradiction(one: Mounted, other: Mounted) -> str:
         height = one.height - other.height
         for k, axis in enumerate("xyz"):
             if abs(turn[k]) * NEAR_VOXELS > LEAST and f"rotation_{axis}_rad" in hidden:
-                return _text(frame, one, f"turned by {np.degrees(abs(turn[k])):.1f} degrees", axis)
+                degrees = np.degrees(abs(turn[k]))
+                return _text(frame, one.base_frame, f"turned by {degrees:.1f} degrees about {axis}")
             if abs(shift[k]) <= LEAST * one.voxel:
                 continue
             if axis != "z" and f"lever_{axis}_m" in hidden:
-                return _text(frame, one, f"shifted by {abs(shift[k]):.2f} m", axis)
+                shifted = f"shifted by {abs(shift[k]):.2f} m along {axis}"
+                return _text(frame, one.base_frame, shifted)
             if axis == "z" and abs(height + shift[k]) < ALIKE * abs(shift[k]):
                 return (
                     f"'{frame}' is mounted in '{one.base_frame}' at z = {first[2, 3]:.2f} m in one"
@@ -98,10 +106,8 @@ def contradiction(one: Mounted, other: Mounted) -> str:
     return ""
 
 
-def _text(frame: str, one: Mounted, what: str, axis: str) -> str:
-    """``axis`` is the one about or along which the mountings differ."""
-    preposition = "about" if "turned" in what else "along"
+def _text(frame: str, base_frame: str, difference: str) -> str:
     return (
-        f"'{frame}' is mounted in '{one.base_frame}' {what} {preposition} {axis} between both, and"
-        " their drives are too straight or too short to show which is right"
+        f"'{frame}' is mounted in '{base_frame}' {difference} between both, and their drives are"
+        " too straight or too short to show which is right"
     )

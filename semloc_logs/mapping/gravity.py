@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.mapping.up_evidence import Sky, UpEvidence
+from semloc_logs.numerics.transforms import angle_between
 
 F64 = NDArray[np.float64]
 
@@ -176,7 +177,7 @@ def _gravity(
 
 
 def _degrees(a: F64, b: F64) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+    return float(np.degrees(angle_between(a, b)))
 
 
 def _none(expected: Expected) -> Problem:

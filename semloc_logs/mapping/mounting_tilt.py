@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.transforms import angle_between
+
 F64 = NDArray[np.float64]
 
 LEAST_TURN = np.radians(4.0)  # lanes are banked by a degree or two, an IMU is off by one
@@ -27,11 +29,11 @@ def turn_about_way(
 ) -> float:
     """Angle (rad) about the ``way`` (3,) from gravity to ``up`` (3,) of ground and walls; else 0.
 
-    It is told where the ``imu`` (3,) and the ``convention`` (3,) agree about gravity, and where
+    It is reported where the ``imu`` (3,) and the ``convention`` (3,) agree about gravity, and where
     walls beside the way, of flat places with ``normals`` (n, 3) and ``weights`` (n,), stand at
     right angles to the ground: a road may be inclined, a house is not.
     """
-    if _angle(imu, convention) > SURE:
+    if angle_between(imu, convention) > SURE:
         return 0.0
     seen = up - (up @ way) * way
     true = imu - (imu @ way) * way
@@ -39,11 +41,13 @@ def turn_about_way(
     if abs(turn) < LEAST_TURN:
         return 0.0
     beside = np.abs(normals @ way) < ACROSS
-    plumb, by_gravity = (
-        float(weights[beside & (np.abs(normals @ direction) < PLUMB)].sum())
-        for direction in (up, imu)
-    )
-    is_wall = plumb >= LEAST_WALLS * float(weights.sum()) and plumb > MORE_PLUMB * by_gravity
+
+    def plumb_weight(direction: F64) -> float:
+        """Of the places beside the way that are plumb if ``direction`` (3,) is up."""
+        return float(weights[beside & (np.abs(normals @ direction) < PLUMB)].sum())
+
+    plumb = plumb_weight(up)
+    is_wall = plumb >= LEAST_WALLS * float(weights.sum()) and plumb > MORE_PLUMB * plumb_weight(imu)
     return turn if is_wall else 0.0
 
 
@@ -57,7 +61,3 @@ def straight_way(positions: F64, voxel: float) -> F64 | None:
     if length < max(LEAST_WAY * voxel, STRAIGHT * way):
         return None
     return np.asarray(chord / length)
-
-
-def _angle(a: F64, b: F64) -> float:
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))

@@ -84,6 +84,11 @@ def rotation_angle(rotation: Array) -> float:
     return float(np.linalg.norm(Rotation.from_matrix(rotation).as_rotvec()))
 
 
+def angle_between(a: Array, b: Array) -> float:
+    """Angle in radians between two directions (3,) of any length, accurate near zero."""
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
 def rotation_between(source: Array, target: Array) -> Array:
     """The smallest rotation (3, 3) that turns direction ``source`` into direction ``target``."""
     a = source / np.linalg.norm(source)

@@ -319,7 +319,8 @@ class Closures(Section):
     )
     misfits: bool = Field(
         False,
-        description="whether sessions whose poses do not fit their range data get closures, too",
+        description="whether sessions whose poses do not fit their range data, and pairs whose"
+        " mountings contradict each other, get closures, too",
     )
     rejected_per_query: int = Field(
         3, ge=0, description="best rejected hypotheses of a query that are reported"

@@ -78,7 +78,7 @@ def decide_all(
     """Write the tables of closures and rejections, and the picture; whether they were not there.
 
     They are of the alignments of all pairs (``known``, where they are known already), without
-    sessions whose poses do not fit.
+    sessions whose poses do not fit and pairs whose mountings contradict each other.
     """
     known = known_pairs(work) if known is None else known
     if not overwrite and is_decided(work, settings, known):
@@ -106,7 +106,7 @@ def decide_all(
 
 
 def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> Outcomes:
-    """What becomes of the alignments of all pairs, without sessions whose poses do not fit."""
+    """What becomes of the alignments of all pairs that :func:`decide_all` uses."""
     paths = _used_alignments(work, maps, settings, known_pairs(work))
     return _decided(paths, maps, settings, _searched(paths, maps, settings))
 

@@ -625,11 +625,11 @@ def test_a_log_borrows_transforms_from_those_of_other_sessions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it borrows is an input of the session."""
-    asked: list[tuple[Any, ...]] = []
+    calls: list[tuple[Any, ...]] = []
     lent = Mountings()
 
     def lend(paths: Any, others: Any, topics: Any, child: Any, memory: int) -> Mountings:
-        asked.append((paths, others, child))
+        calls.append((paths, others, child))
         return lent
 
     monkeypatch.setattr(fuse_stage, "lent_transforms", lend)
@@ -642,21 +642,21 @@ def test_a_log_borrows_transforms_from_those_of_other_sessions(
         return [t.fingerprint for t in fuse_stage.plan_fuse(sessions, work, settings).tasks]
 
     first = planned()
-    assert asked == [((a, b), [c], None), ((c,), [a, b], None)]
-    asked.clear()
+    assert calls == [((a, b), [c], None), ((c,), [a, b], None)]
+    calls.clear()
     planned(fusion__odometry="lidar")
-    assert [child for _, _, child in asked] == ["base_link", "base_link"]
+    assert [child for _, _, child in calls] == ["base_link", "base_link"]
     transform = StaticTransform("base_link", "lidar", (0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0))
     lent = Mountings(lent=(transform,))
     assert not set(planned()) & set(first)
     write_truth(tmp_path / "poses.tum", np.array([0, 1]), np.array([np.eye(4), np.eye(4)]))
     for frame, expected in (("imu", "imu"), ("", "base_link")):
-        asked.clear()
+        calls.clear()
         sessions = [
             SessionInput("c", (c,), poses=TrajectoryFile(tmp_path / "poses.tum", None, frame))
         ]
         planned()
-        assert asked == [((c,), [], expected)]
+        assert calls == [((c,), [], expected)]
 
 
 def test_workers_in_another_folder_find_the_log_and_the_workspace(

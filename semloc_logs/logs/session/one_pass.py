@@ -47,6 +47,7 @@ class CloudPass:
         cameras: CameraClouds,
         builder: CloudBuilder,
         relay: ImageRelay,
+        stamp_offsets: StampOffsets,
         most_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
         self.poses = poses
@@ -56,7 +57,7 @@ class CloudPass:
         self.fixes = Fixes()
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
-        self.stamp_offsets = StampOffsets()
+        self.stamp_offsets = stamp_offsets
         self.repeats = Repeats()
         self.waiting = FrameQueue(most_bytes)
         self.relay = relay

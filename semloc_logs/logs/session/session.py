@@ -407,6 +407,5 @@ class Session:
         limits = RangeLimits(options.min_range, options.max_range)
         builder = CloudBuilder(roles, poses, cameras, duplicates, limits)
         most_bytes = self._options.logs.memory // _SHARE_OF_WAITING
-        new = CloudPass(roles, poses, cameras, builder, relay, most_bytes)
-        new.stamp_offsets = StampOffsets(self._reading.offset_ns)
-        return new
+        stamp_offsets = StampOffsets(self._reading.offset_ns)
+        return CloudPass(roles, poses, cameras, builder, relay, stamp_offsets, most_bytes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.findings import LEAST_PAIRS, LEAST_SIGMAS, NEAR_VOXELS, WRONG
 from semloc_logs.mapping.fit.keyframe_pairs import (
@@ -29,6 +28,7 @@ from semloc_logs.mapping.fit.model import (
 )
 from semloc_logs.mapping.fit.way import BETTER
 from semloc_logs.numerics.evenly import evenly
+from semloc_logs.numerics.transforms import exp_se3
 
 F64 = NDArray[np.float64]
 
@@ -40,6 +40,7 @@ ROUNDS = 5  # of the weights of pairs that are off
 # searched in these steps, up to so far (voxels), by so many pairs
 STEP, FARTHEST, TRIED = 0.3, 10.0, 6
 LEAST_SHOWN = np.array([0.01] * 3 + [0.002] * 3)  # m and rad, of a standard deviation
+UNTURNED = np.zeros(3)  # rotation vector
 MOST_STARTS = 8  # registrations, each from the offset of the one before
 
 
@@ -101,7 +102,7 @@ def _searched(both: Clouds, found: Registered) -> F64:
             measured = found.pairs.measured[row]
             usual += float(registrar.shares_along(target, source, [measured], direction)[0])
             given = motion(both, target, source)
-            tried = [given @ _moved(distance * direction) for distance in distances]
+            tried = [given @ exp_se3(distance * direction, UNTURNED) for distance in distances]
             shares += registrar.shares_along(target, source, tried, direction)
         better = float(shares.max()) / usual
         if better > max(BETTER, most):
@@ -110,20 +111,13 @@ def _searched(both: Clouds, found: Registered) -> F64:
     return best
 
 
-def _moved(shift: F64) -> F64:
-    out = np.eye(4)
-    out[:3, 3] = shift
-    return out
-
-
 def _is_sure(offset: F64, sigma: F64) -> bool:
     return bool((np.abs(offset) >= LEAST_SIGMAS * sigma).any())
 
 
 def _start(both: Clouds, offset: F64) -> Start:
     """Registration starts where the second cloud is moved by ``offset`` (6,)."""
-    moved = _moved(offset[:3])
-    moved[:3, :3] = Rotation.from_rotvec(offset[3:]).as_matrix()
+    moved = exp_se3(offset[:3], offset[3:])
     return lambda target, source: motion(both, target, source) @ moved
 
 
@@ -131,13 +125,14 @@ def _pairs(clouds: Clouds, others: Clouds) -> tuple[Clouds, list[tuple[int, int]
     """The keyframes of both streams, and pairs of one of each at about the same time."""
     both = Clouds(clouds.collected, np.r_[clouds.rows, others.rows], clouds.voxel)
     count = len(clouds.rows)
-    mine = clouds.stamps_ns()
-    its = others.stamps_ns()
+    stamps_ns = clouds.stamps_ns()
+    other_stamps_ns = others.stamps_ns()
     pairs = []
     for number in evenly(count, PAIRS).tolist():
-        other = int(np.argmin(np.abs(its - mine[number])))
+        apart_ns = np.abs(other_stamps_ns - stamps_ns[number])
+        other = int(np.argmin(apart_ns))
         is_known = clouds.pose(number) is not None and others.pose(other) is not None
-        if is_known and abs(int(its[other]) - int(mine[number])) <= LONGEST_NS:
+        if is_known and apart_ns[other] <= LONGEST_NS:
             pairs.append((number, count + other))
     return both, pairs
 
@@ -148,18 +143,18 @@ def _offset(found: Registered, poses_at: PosesAt) -> tuple[F64, F64]:
     The mean of the pairs, each weighted by its covariance; pairs far off count less and less.
     """
     predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
-    off = -difference(found.pairs.measured, predicted)
-    known = np.isfinite(off).all(1)
-    off = off[known]
+    offsets = -difference(found.pairs.measured, predicted)
+    known = np.isfinite(offsets).all(1)
+    offsets = offsets[known]
     information = np.linalg.inv(found.pairs.covariance[known])
-    offset = np.median(off, axis=0)
-    squares = np.zeros(len(off))
+    offset = np.median(offsets, axis=0)
+    squares = np.zeros(len(offsets))
     hessian = information.sum(0)
     for _ in range(ROUNDS):
-        rest = off - offset
+        rest = offsets - offset
         squares = np.einsum("ni,nij,nj->n", rest, information, rest)
         weighted = information / (1.0 + squares / OUTLIER**2)[:, None, None]
         hessian = weighted.sum(0)
-        offset = np.linalg.solve(hessian, np.einsum("nij,nj->i", weighted, off))
+        offset = np.linalg.solve(hessian, np.einsum("nij,nj->i", weighted, offsets))
     covariance = scatter(squares) * np.linalg.inv(hessian)
     return offset, np.sqrt(np.diag(covariance))
