@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,62 +28,72 @@ ALIKE = 0.5  # of a difference of mountings in height, by which the sensor is as
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounted:
-    """The mountings of a session.
+    """The mountings of the range sensors of a session.
 
-    ``base_T_sensors`` (4, 4) by frame; ``hidden``: faults that its drive does not show; ``height``:
-    of the base frame above the ground (m); nan where no ground was seen.
+    ``base_T_sensors`` (4, 4) by frame, and the faults of each that its drive does not show
+    (``hidden``); ``height`` of the base frame above the ground (m), nan where no ground was seen.
     """
 
     base_frame: str
     base_T_sensors: Mapping[str, F64]
-    hidden: frozenset[str]
+    hidden: Mapping[str, frozenset[str]]
     height: float
     voxel: float
 
-    @property
-    def mountings(self) -> dict[str, bytes]:
-        """The bytes of the mountings: equal ones are compared at once."""
-        return {frame: T.tobytes() for frame, T in self.base_T_sensors.items()}
-
     @staticmethod
     def of(session: SessionMap) -> Mounted:
-        """The one of a session with keyframes."""
-        content = session.json
-        hidden: set[str] = set()
-        for stream in (content.get("fit") or {"streams": []})["streams"]:
-            hidden |= {*(NAMES if stream["pairs"] < LEAST_PAIRS else stream["hidden"])}
+        """The mountings of a session with keyframes."""
+        hidden: dict[str, frozenset[str]] = {}
+        for stream in _streams(session):
+            untold = NAMES if stream["pairs"] < LEAST_PAIRS else stream["hidden"]
+            for frame in stream.get("frames", ()):
+                # another sensor in this frame may show them
+                hidden[frame] = hidden.get(frame, frozenset(NAMES)) & {*untold}
         heights = session.map_T_base[:, 2, 3] - session.ground_z
         known = heights[np.isfinite(heights)]
         return Mounted(
-            str(content.get("base_frame", "")),
-            {frame: np.array(T) for frame, T in content.get("base_T_sensors", {}).items()},
-            frozenset(hidden),
+            str(session.json.get("base_frame", "")),
+            {frame: np.array(T) for frame, T in _base_T_sensors(session).items()},
+            hidden,
             float(np.median(known)) if len(known) else np.nan,
-            float(content["voxel_size"]),
+            float(session.json["voxel_size"]),
         )
+
+
+def _streams(session: SessionMap) -> list[dict[str, Any]]:
+    """The check of each range stream."""
+    return list((session.json.get("fit") or {"streams": []})["streams"])
+
+
+def _base_T_sensors(session: SessionMap) -> dict[str, Any]:
+    """``base_T_sensor`` of the frames of range sensors; cameras that only paint labels are none."""
+    frames = {frame for stream in _streams(session) for frame in stream.get("frames", ())}
+    base_T_sensors = session.json.get("base_T_sensors", {})
+    return {frame: T for frame, T in base_T_sensors.items() if frame in frames}
 
 
 def contradictions(maps: Mapping[str, SessionMap]) -> dict[frozenset[str], str]:
     """The pairs of sessions that contradict each other, with the end of a sentence about them."""
-    mounted = {name: Mounted.of(m) for name, m in sorted(maps.items()) if m.posed and not m.is_map}
-    mountings = {name: session.mountings for name, session in mounted.items()}
-    found = {}
-    for name, other in combinations(mounted, 2):
-        if mountings[name] == mountings[other]:  # as of most of many sessions
-            continue
-        if text := contradiction(mounted[name], mounted[other]):
-            found[frozenset((name, other))] = text
-    return found
+    sessions = {name: m for name, m in sorted(maps.items()) if m.posed and not m.is_map}
+    mountings = {name: _base_T_sensors(session) for name, session in sessions.items()}
+    pairs = [
+        (name, other)
+        for name, other in combinations(sessions, 2)
+        if mountings[name] != mountings[other]  # most of many sessions have equal ones
+    ]
+    mounted = {name: Mounted.of(sessions[name]) for name in {name for p in pairs for name in p}}
+    texts = {frozenset(pair): contradiction(*(mounted[name] for name in pair)) for pair in pairs}
+    return {pair: text for pair, text in texts.items() if text}
 
 
 def contradiction(one: Mounted, other: Mounted) -> str:
     """How the mountings of two sessions contradict each other; empty where they do not."""
     if one.base_frame != other.base_frame:
         return ""
-    hidden = one.hidden | other.hidden
     for frame in sorted(one.base_T_sensors.keys() & other.base_T_sensors.keys()):
         first = one.base_T_sensors[frame]
         second = other.base_T_sensors[frame]
+        hidden = one.hidden[frame] | other.hidden[frame]
         shift = first[:3, 3] - second[:3, 3]
         turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()
         if np.linalg.norm(turn) > OTHER_AXES:

@@ -14,7 +14,7 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.other_mountings import contradictions
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.closures.same_recording import same_recordings
 from semloc_logs.closures.session_pairs import Pair, known_pairs
@@ -29,7 +29,6 @@ from semloc_logs.stages.pair_search import (
     PairSearch,
     Selection,
     metadata_of,
-    misfits_of,
 )
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
@@ -58,11 +57,10 @@ def close(
     searches = search.run(engine)
     is_new = decide_all(work, search.maps, settings, search.searched(), overwrite=overwrite)
     report = Report(closures=len(read_closures(work.closures)), amount=searches)
-    misfits = misfits_of(search.maps, settings)
-    report.skipped += misfits.values()
-    fitting = {name: m for name, m in search.maps.items() if name not in misfits}
+    exclusions = Exclusions.of(search.maps, settings)
+    report.skipped += exclusions.sentences()
+    fitting = {name: m for name, m in search.maps.items() if name not in exclusions.misfits}
     report.skipped += same_recordings(fitting)
-    report.skipped += _contradicting(fitting, settings).values()
     (report.done if is_new else report.kept).append("closures")
     return report
 
@@ -128,24 +126,12 @@ def _searched(pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> dict[str
 def _used_alignments(
     work: Workspace, maps: Maps, settings: Resolved, known: Mapping[Pair, str]
 ) -> dict[Pair, Path]:
-    """The tables of alignments of the pairs of sessions whose poses fit, and whose mountings do."""
-    misfits = misfits_of(maps, settings)
-    pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
-    names = {name for pair in pairs for name in (pair.query, pair.target)}
-    others = _contradicting({name: maps[name] for name in names}, settings)
-    pairs = [p for p in pairs if frozenset((p.query, p.target)) not in others]
-    return {pair: work.alignments(pair.query, pair.target) for pair in pairs}
-
-
-def _contradicting(maps: Maps, settings: Resolved) -> dict[frozenset[str], str]:
-    """Pairs of sessions without closures, since their mountings contradict each other, and why."""
-    if settings.closures.misfits:
-        return {}
+    """The tables of alignments of the pairs of sessions that may get closures."""
+    exclusions = Exclusions.of(maps, settings)
     return {
-        pair: f"Sessions {' and '.join(sorted(pair))} get no closures with each other: {text};"
-        " give the right mounting with --set logs.mountings.FRAME=[x,y,z,qx,qy,qz,qw], or take"
-        " them all the same with --set closures.misfits=true, as where they are of two vehicles."
-        for pair, text in contradictions(maps).items()
+        pair: work.alignments(pair.query, pair.target)
+        for pair in sorted(known)
+        if not exclusions.has(pair)
     }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.closures.session_pairs import known_pairs
 from semloc_logs.errors import SemlocError, WorkspaceError
@@ -22,7 +23,6 @@ from semloc_logs.stages.pair_search import (
     EVERYTHING,
     PairSearch,
     Selection,
-    misfits_of,
     pair_fingerprints,
 )
 from semloc_logs.tables.table import read_json
@@ -104,12 +104,10 @@ class Plan:
             PairSearch.of(self._work, self._settings, selection, overwrite=overwrite)
         folders = [f for f in self._work.sessions() if f.name not in self._coming]
         maps = {folder.name: SessionMap(folder) for folder in folders}
-        misfits = misfits_of(maps, self._settings)
+        exclusions = Exclusions.of(maps, self._settings)
         fingerprints = pair_fingerprints(maps, self._settings)
         known = known_pairs(self._work)
-        possible = [
-            p for p in fingerprints if selection.has(p) and not misfits.keys() & {p.query, p.target}
-        ]
+        possible = [p for p in fingerprints if selection.has(p) and not exclusions.has(p)]
         todo = [p for p in possible if overwrite or known.get(p) != fingerprints[p]]
         queries = {
             name: len(query_keyframes(maps[name], self._settings))
@@ -119,7 +117,9 @@ class Plan:
         names = [f"{pair.query} in {pair.target}" for pair in todo]
 
         # sessions that are still logs: by the times of their recording
-        starts = {name: int(m.stamps_ns[0]) for name, m in maps.items() if name not in misfits}
+        starts = {
+            name: int(m.stamps_ns[0]) for name, m in maps.items() if name not in exclusions.misfits
+        }
         starts |= {name: one.start_ns for name, one in self._coming.items()}
         order = sorted(starts, key=lambda name: (starts[name], name))
         for number, query in enumerate(order):

@@ -11,6 +11,7 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.closures.search_tasks import SearchTask, block_size, search_queries
 from semloc_logs.closures.session_pairs import (
@@ -94,7 +95,8 @@ class PairSearch:
                 " all."
             )
         known = known_pair(work, pair)
-        is_missing = known.get(pair) != fingerprints[pair] and not misfits_of(maps, settings)
+        is_excluded = Exclusions.of(maps, settings).has(pair)
+        is_missing = known.get(pair) != fingerprints[pair] and not is_excluded
         chosen = [pair] if is_missing else []
         _check_words(work, chosen, maps, settings)
         return cls(work, maps, settings, fingerprints, known, chosen, alone=True)
@@ -113,14 +115,14 @@ class PairSearch:
         maps = {folder.name: SessionMap(folder) for folder in work.chosen(())}
         for session in maps.values():
             check_settings(session, settings)
-        misfits = misfits_of(maps, settings)
+        exclusions = Exclusions.of(maps, settings)
         fingerprints = pair_fingerprints(maps, settings)
         known = known_pairs(work)
         chosen = [
             pair
             for pair, fingerprint in fingerprints.items()
             if selection.has(pair)
-            and not misfits.keys() & {pair.query, pair.target}
+            and not exclusions.has(pair)
             and (overwrite or known.get(pair) != fingerprint)
         ]
         _check_words(work, chosen, maps, settings)
@@ -217,18 +219,6 @@ class PairSearch:
             target: metadata_of(self.settings, (self.maps[one.session], self.maps[target]))
             for target in one.fingerprints
         }
-
-
-def misfits_of(maps: Maps, settings: Resolved) -> dict[str, str]:
-    """Sessions that get no closures, since these would be false, and the sentences that say so."""
-    if settings.closures.misfits:
-        return {}
-    return {
-        name: f"Session {name} gets no closures: its poses do not fit ({'; '.join(misfits)});"
-        " --set closures.misfits=true searches it all the same."
-        for name, session_map in sorted(maps.items())
-        if (misfits := session_map.misfits)
-    }
 
 
 def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any]:

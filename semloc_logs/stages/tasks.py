@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.session_pairs import Pair, known_pairs, pairs_of_sessions
 from semloc_logs.engines import Engine
 from semloc_logs.errors import SettingsError, WorkspaceError, did_you_mean
@@ -20,7 +21,7 @@ from semloc_logs.stages.describe import describe, plan_describe
 from semloc_logs.stages.fuse import fuse, plan_fuse
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.lock import searching
-from semloc_logs.stages.pair_search import PairSearch, misfits_of, pair_fingerprints
+from semloc_logs.stages.pair_search import PairSearch, pair_fingerprints
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
 from semloc_logs.workspace import Workspace
@@ -98,9 +99,8 @@ def _task_names(
             return sorted((folder.name,) for folder in work.chosen(()))
         case Stage.SEARCH:
             maps = _maps(work)
-            misfits = misfits_of(maps, settings).keys()
-            pairs = pairs_of_sessions(maps)
-            return [(p.query, p.target) for p in pairs if not misfits & {p.query, p.target}]
+            exclusions = Exclusions.of(maps, settings)
+            return [(p.query, p.target) for p in pairs_of_sessions(maps) if not exclusions.has(p)]
         case Stage.DECIDE:
             return [()]
 
@@ -163,7 +163,7 @@ def _search(pair: Pair, work: Workspace, settings: Resolved, engine: Engine) -> 
         search = PairSearch.of_pair(work, settings, pair)
         keep(work, settings)
         search.run(engine)
-    report = Report(skipped=list(misfits_of(search.maps, settings).values()))
+    report = Report(skipped=Exclusions.of(search.maps, settings).sentences())
     (report.done if search.chosen else report.kept).append(f"search/{pair.query}/{pair.target}")
     return report
 

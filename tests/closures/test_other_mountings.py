@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from semloc_logs.closures.other_mountings import Mounted, contradiction
+from semloc_logs.closures.exclusions import Exclusions
+from semloc_logs.closures.other_mountings import Mounted, contradiction, contradictions
+from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.numerics.transforms import exp_se3
+from semloc_logs.settings import load
 
 
 def session(
@@ -21,7 +27,7 @@ def session(
     """A LIDAR at x, z with a roll (degrees), in a base frame ``height`` above the ground."""
     pose = exp_se3(np.zeros(3), np.array([np.radians(roll), 0.0, 0.0]))
     pose[:3, 3] = x, 0.0, z
-    return Mounted(base, {"lidar": pose}, frozenset(hidden), height, 0.3)
+    return Mounted(base, {"lidar": pose}, {"lidar": frozenset(hidden)}, height, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -55,3 +61,65 @@ def test_mountings_of_which_one_is_wrong_are_named(other: Mounted, words: str) -
 )
 def test_other_vehicles_and_small_differences_are_not_named(other: Mounted) -> None:
     assert contradiction(session(), other) == ""
+
+
+def mounted_at(x: float, camera_x: float = 0.0, hidden: tuple[str, ...] = ("lever_x_m",)) -> Any:
+    """A session with a LIDAR and a camera beside it; only the LIDAR measures ranges."""
+    poses = {"lidar": np.eye(4), "camera": np.eye(4)}
+    poses["lidar"][0, 3] = x
+    poses["camera"][0, 3] = camera_x
+    stream = {"pairs": 24, "hidden": list(hidden), "frames": ["lidar"]}
+    return SimpleNamespace(
+        posed=True,
+        is_map=False,
+        misfits=[],
+        map_T_base=np.eye(4)[None],
+        ground_z=np.array([-1.9]),
+        json={
+            "base_frame": "base_link",
+            "voxel_size": 0.3,
+            "base_T_sensors": {frame: pose.tolist() for frame, pose in poses.items()},
+            "fit": {"streams": [stream]},
+        },
+    )
+
+
+def test_a_camera_that_only_paints_labels_is_not_compared() -> None:
+    assert contradictions({"a": mounted_at(0.0), "b": mounted_at(0.0, camera_x=1.5)}) == {}
+    assert list(contradictions({"a": mounted_at(0.0), "b": mounted_at(1.5)})) == [{"a", "b"}]
+
+
+def test_what_one_stream_hides_is_not_hidden_of_another_sensor() -> None:
+    shown = mounted_at(1.5, hidden=())
+    shown.json["fit"]["streams"].append({"pairs": 0, "hidden": [], "frames": ["depth"]})
+    assert contradictions({"a": mounted_at(0.0, hidden=()), "b": shown}) == {}
+
+
+def test_many_pairs_with_one_contradiction_are_one_sentence() -> None:
+    maps = {name: mounted_at(0.0) for name in "abc"} | {name: mounted_at(1.5) for name in "de"}
+    exclusions = Exclusions.of(maps, load().resolved())
+    [sentence] = exclusions.sentences()
+    assert sentence.startswith(
+        "6 pairs of sessions, such as a and d, get no closures with each other: 'lidar' is mounted"
+        " in 'base_link' shifted by 1.50 m along x between both"
+    )
+    excluded = [(q, t) for q in "abcde" for t in "abcde" if exclusions.has(Pair(q, t))]
+    crossing = [(one, other) for one in "abc" for other in "de"]
+    assert sorted(excluded) == sorted(crossing + [(other, one) for one, other in crossing])
+    del maps["b"], maps["c"], maps["e"]
+    [sentence] = Exclusions.of(maps, load().resolved()).sentences()
+    assert sentence.startswith("Sessions a and d get no closures with each other: ")
+
+
+def test_a_session_that_does_not_fit_is_excluded_and_not_compared() -> None:
+    maps = {"a": mounted_at(0.0), "b": mounted_at(1.5)}
+    maps["b"].misfits = ["the poses jump"]
+    exclusions = Exclusions.of(maps, load().resolved())
+    assert exclusions.sentences() == [
+        "Session b gets no closures: its poses do not fit (the poses jump);"
+        " --set closures.misfits=true searches it all the same."
+    ]
+    assert exclusions.has(Pair("b", "b"))
+    assert not exclusions.has(Pair("a", "a"))
+    overruled = load(assignments={"closures.misfits": "true"}).resolved()
+    assert Exclusions.of(maps, overruled).sentences() == []

@@ -15,6 +15,7 @@ from click.testing import CliRunner
 
 from semloc_logs.cli.main import program
 from semloc_logs.closures.closure_tables import read_closures
+from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.engines import Serial
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.drives.drive import simulate_drive
@@ -24,7 +25,8 @@ from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput
-from semloc_logs.tables.table import read_json
+from semloc_logs.stages.pair_search import PairSearch
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 
@@ -69,6 +71,34 @@ def test_a_session_whose_odometry_was_reset_gets_no_closures(
 
     all_the_same = tools.coarse_settings(closures__misfits="true")
     assert close(coarse, all_the_same, Serial()).skipped == []
+
+
+def test_pairs_whose_mountings_contradict_each_other_are_not_searched(
+    coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    settings = tools.coarse_settings()
+    before = read_closures(coarse.closures)
+    path = coarse.session("tuesday").session_json
+    content = read_json(path)
+    [stream] = content["fit"]["streams"]
+    [frame] = stream["frames"]
+    stream["hidden"] = ["lever_x_m"]
+    content["base_T_sensors"][frame][0][3] += 4.0
+    write_json(path, content)
+
+    search = PairSearch.of(coarse, settings, overwrite=True)
+    with_others = {p for p in search.chosen if "tuesday" in (p.query, p.target)}
+    assert with_others == {Pair("tuesday", "tuesday")}
+
+    [sentence] = close(coarse, settings, Serial(), overwrite=True).skipped
+    assert "get no closures with each other" in sentence
+    closures = read_closures(coarse.closures)
+    assert len(closures) < len(before)
+    assert all(
+        row["query_session"] == row["target_session"]
+        for row in closures
+        if "tuesday" in (row["query_session"], row["target_session"])
+    )
 
 
 def test_sessions_that_fit_are_recorded_as_such(labelled: Workspace) -> None:

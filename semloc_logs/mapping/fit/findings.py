@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -52,7 +53,7 @@ class StreamFit:
     ``pairs`` were registered; poses and clouds differ by ``translation_m`` and ``rotation_rad`` in
     the median. ``parameters`` are (estimate, standard deviation) by name; ``hidden`` are the faults
     that the drive would not show: a straight one hides a lever arm, a steady one a clock offset.
-    ``drift`` of the poses, where the clouds show it.
+    ``drift`` of the poses, where the clouds show it. ``frames``: of the sensor.
     """
 
     topic: str
@@ -63,6 +64,7 @@ class StreamFit:
     findings: list[Finding] = field(default_factory=list)
     hidden: list[str] = field(default_factory=list)
     drift: Drift | None = None
+    frames: Sequence[str] = ()
 
     @property
     def is_wrong(self) -> bool:
@@ -100,6 +102,7 @@ class StreamFit:
         """For session.json."""
         return {
             "topic": self.topic,
+            "frames": list(self.frames),
             "pairs": self.pairs,
             "translation_m": round(self.translation_m, 4),
             "rotation_rad": round(self.rotation_rad, 5),

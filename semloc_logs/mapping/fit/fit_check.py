@@ -104,6 +104,7 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         added = session.time_offset_of(topic)
         clouds = Clouds(collected, np.array(rows, np.int64), voxel, span, added)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
+        stream.frames = sorted(clouds.frames())
         add_evident_faults(stream, session, clouds)
         if not stream.findings:
             compare(stream, clouds, before, track.at_many)
