@@ -201,6 +201,19 @@ class Session:
         steps = {*pairwise(path), *((b, a) for a, b in pairwise(path))}
         return {edge: change for edge, change in sorted(tree.changes.items()) if edge in steps}
 
+    def fixed_mounting(self, frame_id: str) -> F64 | None:
+        """``base_T_frame`` (4, 4) of another frame that does not move in the base frame; else None.
+
+        Complete after the pass.
+        """
+        frame = frame_name(frame_id)
+        tree = self._pass.poses.tree
+        path = [] if frame == self.base_frame else tree.path(self.base_frame, frame) or []
+        moving = {frozenset((parent, child)) for parent, child, static in tree.edges if not static}
+        if not path or any(frozenset(edge) in moving for edge in pairwise(path)):
+            return None
+        return self.base_T_sensors().get(frame_id)
+
     def repeats(self, topic: str) -> str:
         """What is wrong where a sensor repeats measurements while the poses move; else empty."""
         return self._pass.repeats.text(topic, self.track)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
-from semloc_logs.mapping.fit.model import CLOCK, ROTATION, SCALE, Fault
 
 F64 = NDArray[np.float64]
 OTHER_END = 0.5, 1.5  # of a sweep: an offset may be from its other end
@@ -20,23 +17,12 @@ FOOT, NEAR_FOOT = np.log(1 / 0.3048), 0.03  # of the logarithm of a scale
 OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
 
 
-def fault_text(
-    fault: Fault, known: F64, sigma: Callable[[int], float], topic: str, clouds: Clouds
-) -> str:
-    """The sentence's end about a fault with these parameters (8,)."""
-    if fault is Fault.CLOCK:
-        return _clock_text(topic, known, sigma, clouds)
-    if fault is Fault.LEVER:
-        return _lever_text(known, sigma, clouds.mounting())
-    return _rotation_text(known, sigma) if fault is Fault.ROTATION else _scale_text(known, sigma)
-
-
-def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], clouds: Clouds) -> str:
-    offset = float(parameters[CLOCK])
+def clock_text(topic: str, offset: float, sigma: float, clouds: Clouds) -> str:
+    """The sentence's end about stamps that are ``offset`` seconds behind the poses' clock."""
     side = "behind" if offset > 0 else "ahead of"
     span = clouds.span
     # points were freed of the motion at the wrong time, which shifts the estimate
-    spread = max(sigma(CLOCK), 0.01, BENT * span)
+    spread = max(sigma, 0.01, BENT * span)
     least, most = OTHER_END
     ends = ""
     if least * span <= abs(offset) <= most * span:
@@ -56,24 +42,72 @@ def rounded(seconds: float) -> str:
     return f"{round(seconds, 2) + 0.0:+.2f}"
 
 
-def _rotation_text(parameters: F64, sigma: Callable[[int], float]) -> str:
-    rotation = Rotation.from_rotvec(parameters[ROTATION])
-    turns = []
-    for column, axis in zip(Fault.ROTATION.columns.tolist(), "xyz", strict=True):
-        if parameters[column]:
-            angle = np.degrees(parameters[column])
-            spread = np.degrees(sigma(column))
-            turns.append(f"{angle:.1f} \u00b1 {spread:.1f} degrees about {axis}")
-    convention = ""
+def mounting_text(shift: F64, turn: F64, sigma: F64, clouds: Clouds) -> str:
+    """The sentence's end about a mounting that has to move by ``shift`` (3,) and ``turn`` (3,).
+
+    Metres and a rotation vector in the base frame, 0 where nothing is known, with the standard
+    deviations (6,) of both.
+    """
+    moves = [
+        f"{shift[k]:+.2f} \u00b1 {sigma[k]:.2f} m along {'xyz'[k]}" for k in np.flatnonzero(shift)
+    ]
+    turns = [
+        f"{np.degrees(turn[k]):+.1f} \u00b1 {np.degrees(sigma[3 + k]):.1f} degrees about {'xyz'[k]}"
+        for k in np.flatnonzero(turn)
+    ]
+    parts = []
+    if turns:
+        parts.append(f"be turned by {', '.join(turns)} of the base frame{_convention(turn)}")
+    if moves:
+        parts.append(f"move by {', '.join(moves)} of the base frame{_signs(shift, clouds)}")
+    return f"its mounting has to {' and to '.join(parts)}; {_remedy(shift, turn, clouds)}"
+
+
+def _convention(turn: F64) -> str:
+    """A usual mistake that a turn is near to; else empty."""
+    rotation = Rotation.from_rotvec(turn)
     is_cycle = abs(rotation.magnitude() - OPTICAL) < np.radians(10.0)
     if is_cycle and _is_axis_rotation(rotation):
-        convention = (
-            ", as where the axes of an optical frame are taken for the axes of a body frame"
-        )
+        return ", as where the axes of an optical frame are taken for the axes of a body frame"
+    return ""
+
+
+def _signs(shift: F64, clouds: Clouds) -> str:
+    """Coordinates of the mounting that a shift mirrors; else empty."""
+    mirrored = [
+        f"{axis} of {given:.2f} m"
+        for axis, change, given in zip("xyz", shift, clouds.mounting(), strict=True)
+        if change and abs(change + 2.0 * given) < MIRRORED * abs(change)
+    ]
+    return f", as where its {' and its '.join(mirrored)} has the wrong sign" if mirrored else ""
+
+
+def _remedy(shift: F64, turn: F64, clouds: Clouds) -> str:
+    """How to set the mounting right."""
+    if clouds.mounted is None:
+        return "correct its transform"
+    pose = corrected(clouds.mounted.base_T_sensor, shift, turn)
+    position = ",".join(f"{v + 0.0:.3f}" for v in pose[:3, 3].round(3))
+    rotation = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).round(5)
+    quaternion = ",".join(f"{v + 0.0:.5f}" for v in rotation)
     return (
-        f"its mounting is turned by {', '.join(turns)} of the base frame{convention}; correct its"
-        " transform"
+        f"correct its transform, or give --set logs.mountings.{clouds.mounted.frame}=[{position},"
+        f"{quaternion}]"
     )
+
+
+def corrected(base_T_sensor: F64, shift: F64, turn: F64) -> F64:
+    """A mounting (4, 4) that is turned and moved in the base frame.
+
+    A coordinate that is not shifted stays as it is, also where the mounting is turned: it was not
+    in doubt.
+    """
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    pose = base_T_sensor.copy()
+    pose[:3, :3] = rotation @ base_T_sensor[:3, :3]
+    moved = rotation @ base_T_sensor[:3, 3] + shift
+    pose[:3, 3] = np.where(shift == 0, base_T_sensor[:3, 3], moved)
+    return pose
 
 
 def _is_axis_rotation(rotation: Rotation) -> bool:
@@ -82,33 +116,17 @@ def _is_axis_rotation(rotation: Rotation) -> bool:
     return bool((group.inv() * rotation).magnitude().min() < np.radians(10.0))
 
 
-def _lever_text(parameters: F64, sigma: Callable[[int], float], mounting: F64) -> str:
-    shifts = []
-    mirrored = []
-    for column, axis, given in zip(Fault.LEVER.columns.tolist(), "xyz", mounting, strict=True):
-        off = float(parameters[column])
-        if not off:
-            continue
-        spread = sigma(column)
-        shifts.append(f"{off:.2f} \u00b1 {spread:.2f} m along {axis}")
-        if abs(off + 2.0 * given) < MIRRORED * abs(off):
-            mirrored.append(f"{axis} of {given:.2f} m")
-    sign = f", as where its {' and its '.join(mirrored)} has the wrong sign" if mirrored else ""
-    return (
-        f"its mounting is off by {', '.join(shifts)} of the base frame{sign}; correct its transform"
-    )
-
-
-def _scale_text(parameters: F64, sigma: Callable[[int], float]) -> str:
-    factor = float(np.exp(parameters[SCALE]))
+def scale_text(log_scale: float, sigma: float) -> str:
+    """The sentence's end about clouds that move otherwise than the poses by a factor."""
+    factor = float(np.exp(log_scale))
     if factor < HARDLY_MOVE:
         return (
             f"its clouds move less than {HARDLY_MOVE:g} times as far as the poses: the positions of"
             " the poses are in another unit or along other axes, or the clouds are not of the time"
             " of their stamps"
         )
-    unit = " (a foot is 0.305 m)" if abs(abs(parameters[SCALE]) - FOOT) < NEAR_FOOT else ""
+    unit = " (a foot is 0.305 m)" if abs(abs(log_scale) - FOOT) < NEAR_FOOT else ""
     return (
-        f"its clouds move {factor:.3f} \u00b1 {factor * sigma(SCALE):.3f} times as far as the"
+        f"its clouds move {factor:.3f} \u00b1 {factor * sigma:.3f} times as far as the"
         f" poses: one of both is not in metres{unit}, or the odometry is badly scaled"
     )

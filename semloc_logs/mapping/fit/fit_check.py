@@ -7,7 +7,7 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from semloc_logs.mapping.fit.contradictions import (
     add_unexplained,
 )
 from semloc_logs.mapping.fit.evident_faults import add_evident_faults
-from semloc_logs.mapping.fit.fault_texts import fault_text
+from semloc_logs.mapping.fit.fault_texts import clock_text, mounting_text, scale_text
 from semloc_logs.mapping.fit.findings import (
     LEAST_PAIRS,
     LEAST_SIGMAS,
@@ -37,6 +37,7 @@ from semloc_logs.mapping.fit.findings import (
 )
 from semloc_logs.mapping.fit.keyframe_pairs import (
     Clouds,
+    Mounted,
     Registered,
     Start,
     choose,
@@ -65,7 +66,7 @@ from semloc_logs.mapping.fit.model import (
 )
 from semloc_logs.mapping.fit.other_starts import Doubted
 from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, near_reading
-from semloc_logs.mapping.fit.shared_surfaces import difference_text
+from semloc_logs.mapping.fit.shared_surfaces import offset_between
 from semloc_logs.mapping.fit.way import other_distance, searched
 from semloc_logs.mapping.keyframes import Collected
 
@@ -100,9 +101,14 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     before: list[tuple[str, Clouds]] = []
     for topic in session.roles.ranging:
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
-        span = session.sweep_span_of(topic)
-        added = session.time_offset_of(topic)
-        clouds = Clouds(collected, np.array(rows, np.int64), voxel, span, added)
+        clouds = Clouds(
+            collected,
+            np.array(rows, np.int64),
+            voxel,
+            session.sweep_span_of(topic),
+            session.time_offset_of(topic),
+            _mounted(session, {collected.headers[r].frame_id for r in rows}),
+        )
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         stream.frames = sorted(clouds.frames())
         add_evident_faults(stream, session, clouds)
@@ -114,6 +120,13 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     return check
 
 
+def _mounted(session: Session, frames: Set[str]) -> Mounted | None:
+    """The mounting of a stream that has one frame, and one pose of it in the base frame."""
+    [frame, *others] = sorted(frames) or [""]
+    base_T_sensor = session.fixed_mounting(frame)
+    return None if others or base_T_sensor is None else Mounted(frame, base_T_sensor)
+
+
 def compare(
     stream: StreamFit, clouds: Clouds, before: list[tuple[str, Clouds]], poses_at: PosesAt
 ) -> None:
@@ -122,12 +135,15 @@ def compare(
     It joins them where it agrees with all.
     """
     for topic, others in before:
-        if text := difference_text(others, clouds, poses_at):
+        offset = offset_between(others, clouds, poses_at)
+        for direction in (others.view_direction(), clouds.view_direction()):
+            offset = offset.without(direction, clouds.voxel)
+        if offset:
+            text = mounting_text(offset.shift, offset.turn, offset.sigma, clouds)
             stream.findings.append(
                 Finding(
                     Severity.WRONG,
-                    f"its mounting is off by {text} of the base frame beside the one of {topic},"
-                    " whose surfaces it sees: correct the transform of one of both",
+                    f"beside {topic}, whose surfaces it sees, {text}, or correct the other one",
                 )
             )
             return
@@ -321,13 +337,33 @@ def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds
         faults = [Fault.ROTATION]
     elif abs(_significant(estimate, Fault.SCALE)[SCALE]) > OTHER_UNIT and Fault.SCALE in faults:
         faults = [Fault.SCALE]
-    for fault in faults:
-        known = _significant(estimate, fault)
-        effect = _effect(known, fault, clouds)
-        if effect >= NOTED:
-            severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
-            text = fault_text(fault, known, estimate.sigma, stream.topic, clouds)
-            stream.findings.append(Finding(severity, text))
+    known = {fault: _significant(estimate, fault) for fault in faults}
+    effects = {fault: _effect(known[fault], fault, clouds) for fault in faults}
+    named = [fault for fault in faults if effects[fault] >= NOTED]
+    texts: dict[str, float] = {}  # a turned and shifted mounting is one
+    for fault in named:
+        text = _text(estimate, known, fault, stream.topic, clouds)
+        texts[text] = max(effects[fault], texts.get(text, 0.0))
+    for text, effect in texts.items():
+        severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
+        stream.findings.append(Finding(severity, text))
+
+
+def _text(
+    estimate: Estimate, known: Mapping[Fault, F64], fault: Fault, topic: str, clouds: Clouds
+) -> str:
+    """The sentence's end about a fault, of its ``known`` parameters (8,)."""
+    if fault is Fault.CLOCK:
+        offset = float(known[fault][CLOCK])
+        return clock_text(topic, offset, estimate.sigma(CLOCK), clouds)
+    if fault is Fault.SCALE:
+        return scale_text(float(known[fault][SCALE]), estimate.sigma(SCALE))
+    nothing = np.zeros(PARAMETERS)
+    shift = known.get(Fault.LEVER, nothing)[LEVER]
+    turn = known.get(Fault.ROTATION, nothing)[ROTATION]
+    columns = np.r_[LEVER, ROTATION].tolist()
+    sigma = np.array([estimate.sigma(column) for column in columns])
+    return mounting_text(shift, turn, sigma, clouds)
 
 
 def _enter(stream: StreamFit, joint: Estimate, clouds: Clouds) -> None:

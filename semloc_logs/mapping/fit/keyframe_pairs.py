@@ -57,11 +57,20 @@ Start = Callable[[int, int], F64]
 
 
 @dataclass(frozen=True, eq=False)
+class Mounted:
+    """Where a sensor is all the time: ``base_T_sensor`` (4, 4) of its ``frame``."""
+
+    frame: str
+    base_T_sensor: F64
+
+
+@dataclass(frozen=True, eq=False)
 class Clouds:
     """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m).
 
     ``span``: from the first to the last point of a sweep (s), 0 without times of points.
-    ``time_offset``: what the settings add to the stamps already (s).
+    ``time_offset``: what the settings add to the stamps already (s). ``mounted``: None where the
+    sensor moves in the base frame, or has several frames.
     """
 
     collected: Collected
@@ -69,6 +78,7 @@ class Clouds:
     voxel: float
     span: float = 0.0
     time_offset: float = 0.0
+    mounted: Mounted | None = None
 
     def stamps_ns(self) -> I64:
         """Their stamps (n,)."""
@@ -126,14 +136,28 @@ class Clouds:
 
     def sees_one_side(self) -> bool:
         """Whether the sensor has a narrow field of view: its points lie on one side of it."""
+        return float(np.linalg.norm(self._mean_direction)) > ONE_SIDE
+
+    def view_direction(self) -> F64 | None:
+        """Unit vector (3,) in the base frame where a narrow field of view points; else None."""
+        if not self.sees_one_side():
+            return None
+        return np.asarray(self._mean_direction / np.linalg.norm(self._mean_direction))
+
+    @cached_property
+    def _mean_direction(self) -> F64:
+        """Mean (3,) of the unit directions of the points, in the keyframe of the median one."""
         resultants = []
         for number in np.unique(np.linspace(0, len(self.rows) - 1, LOOKED_AT).astype(np.int64)):
             points, _, _ = self.collected.load(int(self.rows[number]))
             rays = points - self.collected.origins[int(self.rows[number])]
             lengths = np.linalg.norm(rays, axis=1)
             directions = rays[lengths > 0] / lengths[lengths > 0, None]
-            resultants.append(float(np.linalg.norm(directions.mean(0))) if len(directions) else 0.0)
-        return bool(resultants) and float(np.median(resultants)) > ONE_SIDE
+            resultants.append(directions.mean(0) if len(directions) else np.zeros(3))
+        if not resultants:
+            return np.zeros(3)
+        lengths = np.linalg.norm(resultants, axis=1)
+        return np.asarray(resultants[int(np.argsort(lengths)[len(lengths) // 2])])
 
     def pose(self, number: int) -> F64 | None:
         """``session_T_base`` (4, 4) as the poses of the log give it."""
@@ -250,6 +274,8 @@ def registered(
     last: F64 | None = None
     for i, (target, source) in enumerate(numbers):
         seconds = (stamps_ns[source] - stamps_ns[target]) * 1e-9
+        if seconds <= 0:  # clouds of two sensors
+            continue
         if last is not None and fits[i].share < LITTLE * usual:
             speeds = [_moved(factor * last, seconds) for factor in SPEEDS]
             again = registrar.fit(target, source, speeds)
@@ -296,7 +322,7 @@ def _kept(
 def _rate(motion: F64, seconds: float) -> F64:
     """Translation (m/s) and rotation vector (rad/s) of a motion, (6,)."""
     turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    return np.asarray(np.concatenate([motion[:3, 3], turn]) / max(seconds, 1e-3))
+    return np.asarray(np.concatenate([motion[:3, 3], turn]) / seconds)
 
 
 def _moved(rate: F64, seconds: float) -> F64:

@@ -6,6 +6,8 @@ Where both see the same surfaces, clouds of both show how far their mountings di
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,22 +46,49 @@ UNTURNED = np.zeros(3)  # rotation vector
 MOST_STARTS = 8  # registrations, each from the offset of the one before
 
 
-def difference_text(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> str:
-    """How the mounting of ``others`` is off beside the one of ``clouds``; empty where it is not.
+@dataclass(frozen=True, slots=True, eq=False)
+class Offset:
+    """How the mounting of a sensor has to move beside another one.
 
-    Both are streams of one session.
+    By ``shift`` (3,) (m) and ``turn`` (3,) (rotation vector) in the base frame, 0 where it is not
+    sure or does not matter; ``sigma`` (6,) are the standard deviations.
+    """
+
+    shift: F64
+    turn: F64
+    sigma: F64
+
+    def without(self, direction: F64 | None, voxel: float) -> Offset:
+        """The offset where ranges along a unit ``direction`` (3,) have a bias, as of a camera."""
+        if direction is None:
+            return self
+        across = self.shift - (self.shift @ direction) * direction
+        is_off = float(np.linalg.norm(across)) >= WRONG * voxel
+        return replace(self, shift=self.shift if is_off else np.zeros(3))
+
+    def __bool__(self) -> bool:
+        return bool(self.shift.any() or self.turn.any())
+
+
+NO_OFFSET = Offset(np.zeros(3), np.zeros(3), np.zeros(6))
+
+
+def offset_between(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> Offset:
+    """How the mounting of ``others`` has to move beside the one of ``clouds``.
+
+    Both are streams of one session. Nothing is known where they see few surfaces in common.
     """
     both, numbers = _pairs(clouds, others)
     if len(numbers) < LEAST_PAIRS:
-        return ""
+        return NO_OFFSET
     found = registered(both, numbers)
     if len(found.pairs) < LEAST_PAIRS or float(np.median(found.share)) < SHARED:
-        return ""
+        return NO_OFFSET
     shift = _searched(both, found)
     if shift.any():
         found = registered(both, numbers, _start(both, np.r_[shift, np.zeros(3)]))
         if len(found.pairs) < LEAST_PAIRS:
-            return ""
+            return NO_OFFSET
     offset, sigma = _offset(found, poses_at)
     for _ in range(MOST_STARTS):
         before = offset
@@ -67,25 +96,19 @@ def difference_text(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> str:
             break
         found = registered(both, numbers, _start(both, offset))
         if len(found.pairs) < LEAST_PAIRS:
-            return ""
+            return NO_OFFSET
         offset, sigma = _offset(found, poses_at)
         if (np.abs(offset - before) <= sigma).all():
             break
     known = np.where(np.abs(offset) >= LEAST_SIGMAS * sigma, offset, 0.0)
     shown = np.maximum(sigma, LEAST_SHOWN)
     distance = float(np.linalg.norm(known[:3])) / clouds.voxel
-    turn = float(np.linalg.norm(known[3:])) * NEAR_VOXELS
-    parts = []
-    if distance >= WRONG:
-        parts += [f"{known[k]:+.2f} \u00b1 {shown[k]:.2f} m along {'xyz'[k]}" for k in range(3)]
-    if turn >= WRONG:
-        degrees = np.degrees(np.r_[known[3:], shown[3:]])
-        parts += [
-            f"{degrees[k]:+.1f} \u00b1 {degrees[3 + k]:.1f} degrees about {'xyz'[k]}"
-            for k in range(3)
-        ]
-    used = [*(known[:3] if distance >= WRONG else []), *(known[3:] if turn >= WRONG else [])]
-    return ", ".join(part for part, value in zip(parts, used, strict=True) if value)
+    turned = float(np.linalg.norm(known[3:])) * NEAR_VOXELS
+    return Offset(
+        known[:3] if distance >= WRONG else np.zeros(3),
+        known[3:] if turned >= WRONG else np.zeros(3),
+        shown,
+    )
 
 
 def _searched(both: Clouds, found: Registered) -> F64:

@@ -15,8 +15,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.logs.poses.mountings import matrix
+from semloc_logs.mapping.fit.fault_texts import corrected
 from semloc_logs.mapping.fit.findings import SessionFit, Severity, StreamFit
 from semloc_logs.mapping.fit.fit_check import check_stream, explains_much
+from semloc_logs.mapping.fit.keyframe_pairs import Mounted
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Estimate, Fault
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.mapping.keyframes import Collected
@@ -131,6 +134,54 @@ def test_a_turned_mounting_is_found(check: Check, axis: int) -> None:
     assert np.degrees(estimate) == pytest.approx(4.0, abs=0.5)
 
 
+@pytest.mark.parametrize(
+    ("shift", "degrees"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 4.0)),
+        ((1.2, -0.8, 0.0), (0.0, 0.0, 0.0)),
+        ((0.0, 1.0, 0.0), (0.0, 0.0, -6.0)),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 90.0)),
+    ],
+    ids=["turned", "shifted", "both", "other axes"],
+)
+def test_the_mounting_that_is_to_be_given_is_right(
+    tmp_path: Path,
+    streets: SimpleNamespace,
+    shift: tuple[float, ...],
+    degrees: tuple[float, ...],
+) -> None:
+    """With the pose of the sensor as the sentence gives it, the clouds fit the poses."""
+    true = exp_se3(np.array([0.5, 0.2, 1.8]), np.radians([0.0, 5.0, 20.0]))
+    assumed = true.copy()
+    assumed[:3, 3] -= shift
+    assumed[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix().T @ true[:3, :3]
+    wrong = true @ inverse(assumed)
+    folders = [tmp_path / "given", tmp_path / "corrected"]
+    for folder in folders:
+        folder.mkdir()
+    clouds, track = streets.drive(folders[0], base_T_assumed=wrong)
+    clouds = replace(clouds, mounted=Mounted("lidar", assumed))
+    text = _only(check_stream(TOPIC, clouds, track.at_many))
+    values = re.search(r"--set logs\.mountings\.lidar=\[(.*)\]$", text)
+    assert values is not None, text
+    given = matrix(tuple(float(v) for v in values[1].split(",")))
+
+    # clouds in the base frame as it follows from the given pose
+    rest = true @ inverse(given)
+    clouds, track = streets.drive(folders[1], base_T_assumed=rest)
+    assert check_stream(TOPIC, clouds, track.at_many).findings == []
+
+
+def test_coordinates_that_are_not_shifted_stay_where_the_mounting_is_turned() -> None:
+    mounting = yaw_transform(0.0, (2.0, 0.0, 1.0))
+    quarter = np.array([0.0, 0.0, np.pi / 2])
+    turned = corrected(mounting, np.zeros(3), quarter)
+    assert turned == pytest.approx(yaw_transform(np.pi / 2, (2.0, 0.0, 1.0)), abs=1e-12)
+    # turned about the base frame it is at (0, 2, 1), from where it moves by 3 m along x
+    both = corrected(mounting, np.array([3.0, 0.0, 0.0]), quarter)
+    assert both == pytest.approx(yaw_transform(np.pi / 2, (3.0, 0.0, 1.0)), abs=1e-12)
+
+
 def test_a_shifted_mounting_is_found_where_the_vehicle_turns(check: Check) -> None:
     mounting = exp_se3(np.array([1.2, 0.0, 0.0]), np.zeros(3))
     fit = check(base_T_assumed=mounting)
@@ -144,7 +195,7 @@ def test_the_height_of_a_mounting_with_the_wrong_sign_is_found_over_humps(
     """The sensor is 1.9 m above the base, the log has it 1.9 m below: 3.8 m."""
     shift = yaw_transform(0.0, (0.0, 0.0, 3.8))
     text = _only(check(streets.hilly, base_T_assumed=shift, origin=(0.3, 0.0, -1.9)))
-    assert "its mounting is off by 3." in text
+    assert "its mounting has to move by +3." in text
     assert "m along z of the base frame, as where its z of -1.90 m has the wrong sign" in text
     assert "wrong sign" not in _only(
         check(streets.hilly, base_T_assumed=shift, origin=(0.3, 0.0, 1.9))
@@ -242,7 +293,7 @@ def test_axes_of_an_optical_frame_are_found(check: Check) -> None:
 def test_a_sensor_mounted_backwards_is_named_alone_and_not_as_optical(check: Check) -> None:
     backwards = yaw_transform(np.pi, (0.0, 0.0, 0.0))
     text = _only(check(base_T_assumed=backwards))
-    assert "its mounting is turned by" in text
+    assert "its mounting has to be turned by +180.0" in text
     assert "180.0" in text
     assert "optical" not in text
 
@@ -423,7 +474,7 @@ def test_a_straight_drive_backwards_is_an_inverted_pose_or_a_turned_mounting(
     text = _only(check(streets.straight, seconds=12.0, base_T_assumed=about))
     assert "when the mounting is turned by 180 degrees about z" in text
     assert "which the drive does not tell apart" in text
-    assert "mounting is turned by" in _only(check(base_T_assumed=about))
+    assert "mounting has to be turned by" in _only(check(base_T_assumed=about))
 
 
 def test_an_offset_of_the_clock_that_leads_out_of_the_poses_explains_nothing(
