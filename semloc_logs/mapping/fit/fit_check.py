@@ -165,16 +165,15 @@ def check_stream(
     if len(given.pairs) < LEAST_PAIRS:
         return _far_off(topic, clouds, poses_at, numbers, given)
     given = searched(clouds, given)
-    tried = [given]
-    for start in _starts(clouds, poses_at, given):
-        tried.append(registered(clouds, numbers, start))
-        stream = _judged(topic, clouds, poses_at, tried[-1])
+    others = [registered(clouds, numbers, start) for start in _starts(clouds, poses_at, given)]
+    for found in sorted(others, key=_share, reverse=True):
+        stream = _judged(topic, clouds, poses_at, found)
         if stream.findings:
             return stream
     stream = _judged(topic, clouds, poses_at, given)
     # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
     if not stream.findings and not clouds.sees_one_side():
-        best = max(tried, key=lambda found: float(found.share.sum()))
+        best = max([given, *others], key=_share)
         add_contradictions(
             stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
         )
@@ -219,8 +218,18 @@ def _in_other_unit(
     far = other_distance(coarse, found) if len(found.pairs) >= LEAST_PAIRS else None
     if far is None:
         return None
-    stream = _judged(topic, coarse, poses_at, registered(coarse, numbers, far))
+    longer = registered(coarse, numbers, far)
+    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
+    for start in Doubted.of(coarse, found, squares).motions():
+        if _share(registered(coarse, numbers, start)) > _share(longer):
+            return None  # such as other axes
+    stream = _judged(topic, coarse, poses_at, longer)
     return stream if stream.findings else None
+
+
+def _share(found: Registered) -> float:
+    """The points on planes, as shares summed over the pairs."""
+    return float(found.share.sum())
 
 
 def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:
@@ -232,9 +241,9 @@ def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[St
     # poses from which registration hardly moves are not far off
     if float(np.nanmedian(squares)) > DOUBTFUL:
         doubted = Doubted.of(clouds, given, squares)
-        for start in (doubted.motion(), doubted.other_poses(poses_at)):
-            if start is not None:
-                yield start
+        yield from doubted.motions()
+        if other := doubted.other_poses(poses_at):
+            yield other
 
 
 def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) -> StreamFit:

@@ -23,6 +23,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 TRIED = 4  # pairs that show whether another start is better
+MOST_STARTS = 3  # other motions to start registration from
 # a motion is better when so many times the points lie on planes as where registration ended
 BETTER = 1.15
 # another reading of the poses is better when they are so many times as many as by the poses, and
@@ -52,10 +53,18 @@ class Doubted:
         share, given_share = (float(s[rows].sum()) for s in (found.share, found.given_share))
         return Doubted(clouds, found.numbers[rows], share, given_share)
 
-    def motion(self) -> Start | None:
-        """Other axes, units or none at all, where they bring far more points onto planes."""
-        start, share = self._best(_of_motion(self.clouds))
-        return start if share > max(BETTER * self.share, 1e-9) else None
+    def motions(self) -> list[Start]:
+        """Other axes, units or none at all, where they bring far more points onto planes.
+
+        The best one and the ones that are nearly as good: few beams draw the same rings on the
+        ground in all clouds, which lie on themselves without any motion.
+        """
+        starts = _of_motion(self.clouds)
+        shares = self._shares(starts)
+        if shares.max() <= max(BETTER * self.share, 1e-9):
+            return []
+        order = np.argsort(-shares, kind="stable")[:MOST_STARTS]
+        return [starts[i] for i in order if shares[i] > AS_GOOD * shares.max()]
 
     def other_poses(self, poses_at: PosesAt) -> Start | None:
         """The poses at other times, mirrored, inverted or written by another convention, where far
@@ -67,18 +76,18 @@ class Doubted:
             *_of_clocks(self.clouds, poses_at),
             *_of_mirrors(self.clouds),
         ]
-        start, share = self._best(starts)
+        shares = self._shares(starts)
         least = max(BETTER_THAN_POSES * self.given_share, AS_GOOD * self.share, 1e-9)
-        return start if share > least else None
+        return starts[int(np.argmax(shares))] if shares.max() > least else None
 
-    def _best(self, starts: list[Start]) -> tuple[Start, float]:
+    def _shares(self, starts: list[Start]) -> F64:
+        """The points on planes (n,) from each start, as shares summed over the pairs."""
         registrar = Registrar(self.clouds)
         shares = np.zeros(len(starts))
         for target, source in self.numbers.tolist():
             motions = [start(target, source) for start in starts]
             shares += registrar.shares(target, source, motions)
-        best = int(np.argmax(shares))
-        return starts[best], float(shares[best])
+        return shares
 
 
 def _of_motion(clouds: Clouds) -> list[Start]:
