@@ -22,6 +22,8 @@ from semloc_logs.logs.sensors.picture_calibration import camera_R_rect, fitted_c
 from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one
+_LONGEST_BASELINE = 10.0  # m; two cameras of one vehicle are nearer to each other
+_SAME_BASELINE = 1.25  # by such a factor the baselines of P and of the transforms may differ
 SMALLEST = 32  # px, sides of a picture
 _LARGEST_NUMBER = 1e6  # in K (px), D and P
 # between the optical axes, or the baseline and the rows; a stereo pair has less
@@ -94,6 +96,8 @@ def _rectification(pair: _Pair, right_T_left: F64 | None, *, rectified: bool) ->
         return _as_recorded(pair, right_T_left)
 
     recorded = _baseline_of_infos(left, right)
+    if recorded != 0.0 and right_T_left is not None:
+        _check_same(recorded, float(np.linalg.norm(right_T_left[:3, 3])), pair)
     is_turned = any(not np.allclose(camera.R, np.eye(3), atol=1e-9) for camera in (left, right))
     if recorded != 0.0 and (is_turned or right_T_left is None):
         _check_sides(recorded, pair)
@@ -107,6 +111,7 @@ def _rectification(pair: _Pair, right_T_left: F64 | None, *, rectified: bool) ->
     rotations = bouguet_rotations(right_T_left)
     matrix = _common_matrix(pair, rotations)
     baseline = float(np.linalg.norm(right_T_left[:3, 3]))
+    _check_sides(baseline, pair)
     return _of_maps(pair, rotations, (matrix, matrix), baseline)
 
 
@@ -186,6 +191,21 @@ def _check_sides(baseline: float, pair: _Pair) -> None:
             f"The left camera of {pair.names} sits right of the other: exchange them with "
             f"--topic stereo_left=TOPIC --topic stereo_right=TOPIC."
         )
+    if baseline > _LONGEST_BASELINE:
+        raise LogError(
+            f"The cameras of {pair.names} would be {baseline:.4g} m apart: P[0, 3] = -f * baseline "
+            f"or the transform between them is not in metres; correct it."
+        )
+
+
+def _check_same(baseline: float, of_transforms: float, pair: _Pair) -> None:
+    """LogError where the two baselines (m) that a log has contradict each other."""
+    both = sorted((abs(baseline), abs(of_transforms)))
+    if both[1] > _SAME_BASELINE * both[0]:
+        raise LogError(
+            f"The cameras of {pair.names} are {abs(baseline):.4g} m apart by P of their "
+            f"CameraInfos and {abs(of_transforms):.4g} m by the transforms: correct one of both."
+        )
 
 
 def _baseline_of_infos(left: Camera, right: Camera) -> float:
@@ -201,7 +221,9 @@ def _as_recorded(pair: _Pair, right_T_left: F64 | None) -> Rectification:
     left = pair.left
     right = pair.right
     baseline = _baseline_of_infos(left, right)
-    if baseline == 0.0 and right_T_left is not None:
+    if baseline != 0.0 and right_T_left is not None:
+        _check_same(baseline, float(np.linalg.norm(right_T_left[:3, 3])), pair)
+    elif right_T_left is not None:
         baseline = float(-right_T_left[0, 3])
     if baseline == 0.0:
         raise LogError(

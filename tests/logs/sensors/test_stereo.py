@@ -350,6 +350,11 @@ def test_cameras_that_are_not_a_stereo_pair_are_refused_in_a_sentence() -> None:
             )
         assert str(error.value).endswith(".")
 
+    def apart(metres: float) -> Camera:
+        """A right camera of the same pinhole, so far beside the left one."""
+        P = np.hstack([camera().K, [[-210.0 * metres], [0.0], [0.0]]])
+        return camera("plumb_bob", 1, P=P)
+
     ahead = exp_se3(np.array([-0.2, 0.0, 0.0]), np.zeros(3))
     refused(
         None, "The transform between the cameras of /cam0/camera_info, /cam1/camera_info is unknown"
@@ -391,6 +396,12 @@ def test_cameras_that_are_not_a_stereo_pair_are_refused_in_a_sentence() -> None:
         "plumb_bob", 1, P=np.array([[400.0, 0, 160, -80], [0, 400, 120, 0], [0, 0, 1, 0]])
     )
     refused(None, "do not belong to one rectified pair", rectified=True, right=other)
+    refused(None, "would be 120 m apart: P.* is not in metres", right=apart(120.0))
+    refused(None, "would be 120 m apart", rectified=True, right=apart(120.0))
+    refused(exp_se3(np.array([-120.0, 0, 0]), np.zeros(3)), "would be 120 m apart")
+    for rectified in (False, True):
+        words = "are 0.3 m apart by P of their CameraInfos and 0.2 m by the transforms"
+        refused(ahead, words, rectified=rectified, right=apart(0.3))
     far_off = np.array([[210.0, 0, 1e5], [0, 210, 120], [0, 0, 1]])
     refused(ahead, "Nothing of the pictures is left", right=camera("plumb_bob", 1, K=far_off))
     refused(
