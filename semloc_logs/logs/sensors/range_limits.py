@@ -13,7 +13,7 @@ import numpy as np
 from semloc_logs.frames import F32
 from semloc_logs.logs.problems import ProblemKind, Problems
 
-FEWEST = 10  # pictures that show it
+FEWEST = 10  # pictures that show it for sure; in the first ones a part of the scene may be left out
 LEAST_SHARE = 0.05  # of the pixels have it
 # of the pictures have it as their largest depth; a camera that moves sees no surface so long
 MOSTLY = 0.8
@@ -37,8 +37,8 @@ class _Largest:
 
     @property
     def is_limit(self) -> bool:
-        """Whether pixels of this depth were not measured."""
-        return self.count >= max(FEWEST, MOSTLY * self.pictures)
+        """Whether pixels of this depth are taken to have no measurement."""
+        return self.count >= MOSTLY * self.pictures
 
 
 class RangeLimits:
@@ -60,7 +60,8 @@ class RangeLimits:
         largest.add(limit if share >= LEAST_SHARE else 0.0)
         if not largest.is_limit or limit != largest.depth:
             return depth
-        self._name(topic, limit)
+        if largest.count >= FEWEST:
+            self._name(topic, limit)
         return np.where(is_limit, np.float32(0), depth)
 
     def _name(self, topic: str, limit: float) -> None:
