@@ -282,7 +282,7 @@ class DepthClouds:
 
     ``calibrations``: the newest one by CameraInfo topic; ``problems`` name the unusable ones.
     ``units``: what the values of the images are in, ``unit`` (m) where the user gives it.
-    ``limits``: depths that are no measurement.
+    ``limits``: depths that stand for no measurement.
     """
 
     def __init__(
