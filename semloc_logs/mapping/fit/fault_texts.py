@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.mapping.fit.clock_drift import ClockDrift
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 
 F64 = NDArray[np.float64]
@@ -34,6 +35,16 @@ def clock_text(topic: str, offset: float, sigma: float, clouds: Clouds) -> str:
         f"its stamps are {abs(offset):.2f} \u00b1 {spread:.2f} s {side} the clock"
         f" of the poses{ends}; give --set logs.time_offset.{topic}="
         f"{rounded(offset + clouds.time_offset)}"
+    )
+
+
+def clock_drift_text(drift: ClockDrift) -> str:
+    """The sentence's end about a clock that drifts away from the one of the poses."""
+    return (
+        f"beside the clock of the poses its stamps have to change by {drift.first:+.2f} s in the"
+        f" first part of the drive and by {drift.last:+.2f} s in the last (\u00b1 {drift.sigma:.2f}"
+        " s): the clocks drift apart; keep them together (PTP, NTP), or use the times of recording"
+        " with --set logs.stamps=log"
     )
 
 

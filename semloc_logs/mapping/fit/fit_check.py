@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.clock_drift import ClockDrift, clock_drift
 from semloc_logs.mapping.fit.contradictions import (
     TELLING,
     add_contradictions,
@@ -22,7 +23,12 @@ from semloc_logs.mapping.fit.contradictions import (
     add_unexplained,
 )
 from semloc_logs.mapping.fit.evident_faults import add_evident_faults
-from semloc_logs.mapping.fit.fault_texts import clock_text, mounting_text, scale_text
+from semloc_logs.mapping.fit.fault_texts import (
+    clock_drift_text,
+    clock_text,
+    mounting_text,
+    scale_text,
+)
 from semloc_logs.mapping.fit.findings import (
     LEAST_PAIRS,
     LEAST_SIGMAS,
@@ -273,6 +279,10 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         return stream
     rest = float(np.nanmedian(estimate.squares))
     if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
+        drift = clock_drift(pairs, poses_at, estimate)
+        if drift is not None and drift.is_sure and _drift_effect(drift, clouds) >= WRONG:
+            stream.findings.append(Finding(Severity.WRONG, clock_drift_text(drift)))
+            faults = [fault for fault in faults if fault is not Fault.CLOCK]
         _describe(stream, estimate, faults, clouds)
         joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
         _enter(stream, joint, clouds)
@@ -373,6 +383,13 @@ def _text(
     columns = np.r_[LEVER, ROTATION].tolist()
     sigma = np.array([estimate.sigma(column) for column in columns])
     return mounting_text(shift, turn, sigma, clouds)
+
+
+def _drift_effect(drift: ClockDrift, clouds: Clouds) -> float:
+    """What is left at the ends of a drive (voxels) where the stamps are corrected in the mean."""
+    left = np.zeros(PARAMETERS)
+    left[CLOCK] = 0.5 * drift.change
+    return _effect(left, Fault.CLOCK, clouds)
 
 
 def _enter(stream: StreamFit, joint: Estimate, clouds: Clouds) -> None:

@@ -84,6 +84,10 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def some(self, rows: I64) -> Pairs:
+        """The pairs ``rows`` alone."""
+        return Pairs(self.stamps_ns[rows], self.measured[rows], self.covariance[rows])
+
     @cached_property
     def _motions(self) -> dict[int, tuple[F64, Bools]]:
         return {}

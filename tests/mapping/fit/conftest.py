@@ -83,6 +83,7 @@ def drive(
     *,
     seconds: float = 18.0,
     clock: float = 0.0,
+    fast: float = 0.0,
     base_T_assumed: F64 | None = None,
     scale: float = 1.0,
     is_fixed: bool = False,
@@ -94,8 +95,9 @@ def drive(
 ) -> tuple[Clouds, PoseTrack]:
     """Keyframes three times a second, and the poses twenty times a second, as they are written.
 
-    The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
-    (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
+    The clouds are stamped ``clock`` seconds late, and ``fast`` more each second; their mounting is
+    wrong by ``base_T_assumed`` (true base frame from the one of the clouds); ``scale`` times as
+    large; or in the session frame.
     A LIDAR sees all around, a camera ahead. ``signs``: an axis of the clouds may be mirrored.
     ``origin``: where the sensor is in the base frame, as the log has it. In the seconds ``noisy``
     the points are anywhere.
@@ -119,7 +121,7 @@ def drive(
             points = apply(pose, points)
         if base_T_assumed is not None:
             points = apply(inverse(base_T_assumed), points)
-        stamp_ns = SECOND + round((time + clock) * 1e9)
+        stamp_ns = SECOND + round((time + clock + fast * time) * 1e9)
         header = Header(TOPIC, stamp_ns, stamp_ns, "lidar")
         cloud = PosedCloud(
             header,

@@ -252,6 +252,23 @@ def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
         assert (f"a sweep takes {span:.2f} s" in text) == is_told
 
 
+@pytest.mark.parametrize("fast", [0.02, -0.02])
+def test_a_clock_that_drifts_is_named_with_its_offsets_at_both_ends(
+    check: Check, fast: float
+) -> None:
+    text = _only(check(fast=fast, seconds=30.0))
+    first, last = (float(v) for v in re.findall(r"([+-][0-9.]+) s", text))
+    # the first and the last third of 1.5 to 28.5 s
+    assert first == pytest.approx(-6.0 * fast, abs=0.05)
+    assert last == pytest.approx(-24.0 * fast, abs=0.05)
+    assert "the clocks drift apart" in text
+
+
+def test_a_steady_clock_does_not_drift(check: Check) -> None:
+    assert "drift apart" not in _only(check(clock=0.4, seconds=30.0))
+    assert check(seconds=30.0).findings == []
+
+
 def test_an_offset_is_added_to_the_one_that_is_given_and_as_sure_as_the_sweep_is_short(
     tmp_path: Path, streets: SimpleNamespace
 ) -> None:
