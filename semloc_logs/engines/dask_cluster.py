@@ -24,6 +24,7 @@ from typing import Any, Generic
 import semloc_logs
 from semloc_logs import progress
 from semloc_logs.engines.engine import Result, Task
+from semloc_logs.engines.worker_memory import return_freed_memory
 from semloc_logs.errors import SemlocError, SettingsError, TemporaryError
 from semloc_logs.progress import Progress
 
@@ -254,6 +255,7 @@ class _Call(Generic[Task, Result]):
             )
         if Path(self.folder).is_dir():
             os.chdir(self.folder)
+        return_freed_memory()
         sender = _Sender(worker, self.topic)
         logger = logging.getLogger(PACKAGE_LOGGER)
         before = logger.level

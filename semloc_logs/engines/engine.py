@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol, TypeVar
 
-from semloc_logs.engines.worker_memory import memory_limit
+from semloc_logs.engines.worker_memory import memory_limit, return_freed_memory
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -41,6 +41,7 @@ class Serial:
         self._max_memory = max_memory
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+        return_freed_memory()
         for task in tasks:
             with memory_limit(self._max_memory):
                 result = function(task)

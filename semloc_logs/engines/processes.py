@@ -20,7 +20,7 @@ from typing import NoReturn
 
 from semloc_logs import progress
 from semloc_logs.engines.engine import Result, Task
-from semloc_logs.engines.worker_memory import memory_limit
+from semloc_logs.engines.worker_memory import memory_limit, return_freed_memory
 from semloc_logs.errors import TemporaryError
 from semloc_logs.progress import Progress
 
@@ -178,6 +178,7 @@ def _prepare_worker(queue: SimpleQueue[Event], level: int) -> None:
     parent; its events go to the parent.
     """
     single_threaded()
+    return_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_leave_with_parent, daemon=True).start()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import FrameType
 
@@ -16,6 +19,9 @@ from semloc_logs.errors import TemporaryError
 WORKER_BYTES = 2_000_000_000  # a worker of the search, with maps of a few kilometres: measured
 LOOK_SECONDS = 0.2  # between two looks at the memory
 LEAVE_SECONDS = 3.0  # that a task has to unwind: it may be in a long call of a library
+# glibc keeps freed blocks of up to 32 MB; arrays of a search have 1 to 36 MB
+LARGE_BLOCK = 4 << 20
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 CGROUP_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -54,6 +60,21 @@ def private_memory() -> int:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if os.uname().sysname == "Darwin" else peak * 1024
     return (resident - shared) * os.sysconf("SC_PAGE_SIZE")
+
+
+@cache
+def return_freed_memory() -> None:
+    """Large arrays of this process go back to the system when they are freed, from now on.
+
+    Without it a worker that had searched in ten kilometres held 0.3 GB more, for 3 % less time.
+    Nothing is done with another library than glibc, or where the environment has the limits.
+    """
+    if sys.platform != "linux" or "MALLOC_MMAP_THRESHOLD_" in os.environ:
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, LARGE_BLOCK)
+        mallopt(M_TRIM_THRESHOLD, LARGE_BLOCK)
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
 import sys
 import threading
 import time
@@ -114,3 +116,35 @@ def test_only_the_main_thread_has_a_limit(tasks: ModuleType) -> None:
     thread.start()
     thread.join()
     assert found == [100_000_000]
+
+
+_FREED = """
+import sys
+import numpy as np
+from semloc_logs.engines.worker_memory import private_memory, return_freed_memory
+if sys.argv[1] == "returned":
+    return_freed_memory()
+del [np.ones(1 << 20) for _ in range(2)][:]  # what makes glibc take such blocks from the heap
+before = private_memory()
+blocks, pins = [], []
+for _ in range(40):
+    blocks.append(np.ones(1 << 20))  # 8 MB
+    pins.append(np.ones(2000))  # 16 kB, above it on the heap
+held = private_memory() - before
+blocks.clear()
+print(held >> 20, (private_memory() - before) >> 20)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc alone has the setting")
+def test_freed_arrays_go_back_to_the_system() -> None:
+    """40 arrays of 8 MB, each below a small one that stays."""
+    left = {}
+    for how in ("returned", "kept"):
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("MALLOC_")}
+        command = [sys.executable, "-c", _FREED, how]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        held, left[how] = map(int, run.stdout.split())
+        assert held >= 300
+    assert left["returned"] < 20
+    assert left["kept"] > 200
