@@ -30,13 +30,19 @@ class Hypothesis:
     """A pose of the query in submap ``group`` that word matches voted for.
 
     ``pose`` is ``target_T_query`` as (yaw, x, y, z), radians and metres; ``weight`` the sum of its
-    ``votes``' weights.
+    ``votes``' weights, and ``everywhere`` of all votes that it was pooled from.
     """
 
     group: int
     pose: tuple[float, float, float, float]
     votes: int
     weight: float
+    everywhere: float = 0.0
+
+    @property
+    def agreement(self) -> float:
+        """Its weight beside what chance brings, which grows with the root of all votes."""
+        return self.weight / float(np.sqrt(self.everywhere)) if self.everywhere else np.inf
 
 
 def pool(
@@ -64,9 +70,11 @@ def pool(
     # a cell that both grids have is one hypothesis
     order = np.lexsort((*poses.T[::-1], groups, -weights))
     kept = order[non_maximum_suppression(groups[order], poses[order], CELL_SHARE * cell, most)]
+    everywhere = float(weight.sum())
     columns = (groups[kept], map(tuple, poses[kept].tolist()), votes[kept], weights[kept])
     return [
-        Hypothesis(int(g), pose, int(n), float(w)) for g, pose, n, w in zip(*columns, strict=True)
+        Hypothesis(int(g), pose, int(n), float(w), everywhere)
+        for g, pose, n, w in zip(*columns, strict=True)
     ]
 
 

@@ -128,8 +128,13 @@ def search_query(
     keyframe: int,
     built: tuple[Query, F64],
     find: FindHypotheses | None = None,
+    *,
+    least_agreement: float = 0.0,
 ) -> list[Alignment]:
-    """The same of a query that is built already, with its ``query_T_base``."""
+    """The same of a query that is built already, with its ``query_T_base``.
+
+    There are none where no hypothesis has ``least_agreement``.
+    """
     query, query_T_base = built
     if not len(query.structure[0]):
         return []
@@ -138,6 +143,8 @@ def search_query(
         visible_to(database, session, keyframe), session, keyframe, query, query_T_base
     )
     hypotheses = (find or find_hypotheses)(context)
+    if max((h.agreement for h in hypotheses), default=0.0) < least_agreement:
+        return []
     alignments = [
         alignment
         for candidates in verify_hypotheses(context, hypotheses)

@@ -147,3 +147,14 @@ def test_the_submaps_with_the_heaviest_hypotheses_are_looked_into() -> None:
     assert [h.group for h in keep_best_submaps([*many, found[1]], 1)] == [2]
     assert keep_best_submaps(found, 9) == found
     assert keep_best_submaps([], 3) == []
+
+
+def test_agreement_by_hand() -> None:
+    """Of 25 votes of weight 1, nine are for one cell: 9 / 5."""
+    group = np.zeros(25, np.int64)
+    translation = np.zeros((25, 3))
+    translation[9:, 0] = 10.0 * np.arange(1, 17)
+    best, *_ = pool(group, np.zeros(25), translation + 0.5, np.ones(25), 2.0, 4)
+    assert (best.weight, best.everywhere) == (9.0, 25.0)
+    assert best.agreement == pytest.approx(1.8)
+    assert Hypothesis(0, (0.0, 0.0, 0.0, 0.0), 1, 1.0).agreement == np.inf

@@ -9,9 +9,16 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.query_map import view_centres
+from semloc_logs.closures import matching
 from semloc_logs.closures import target_surface as target_surface_module
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.matching import QueryContext, allowed_words, close_query
+from semloc_logs.closures.matching import (
+    QueryContext,
+    allowed_words,
+    close_query,
+    search_query,
+)
+from semloc_logs.closures.query import build_query
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import everything, visible_to
 from semloc_logs.mapping.selection import road_distance
@@ -361,3 +368,25 @@ def test_a_query_searches_where_it_is_told(out_and_back: tuple[Database, Session
 
     assert close_query(database, session, 5, find) == []
     assert searched == [(session, 5, True, True)]
+
+
+@pytest.mark.parametrize(("least", "verified"), [(1.8, 1), (1.9, 0)])
+def test_a_query_is_not_verified_where_no_hypothesis_agrees_enough(
+    out_and_back: tuple[Database, SessionMap],
+    least: float,
+    verified: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    database, session = out_and_back
+    pose = (0.0, 0.0, 0.0, 0.0)
+    hypotheses = [Hypothesis(0, pose, 1, 1.0, 25.0), Hypothesis(0, pose, 9, 9.0, 25.0)]
+    calls: list[list[Hypothesis]] = []
+
+    def verify(context: QueryContext, hypotheses: list[Hypothesis]) -> list[Any]:
+        calls.append(hypotheses)
+        return []
+
+    monkeypatch.setattr(matching, "verify_hypotheses", verify)
+    built = build_query(session, 5, database.settings)
+    search_query(database, session, 5, built, lambda _: hypotheses, least_agreement=least)
+    assert calls == [hypotheses] * verified

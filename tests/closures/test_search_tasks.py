@@ -12,7 +12,12 @@ import pytest
 
 from semloc_logs.closures import search_tasks
 from semloc_logs.closures.closure import Features
-from semloc_logs.closures.search_tasks import SearchTask, _search_block, block_size
+from semloc_logs.closures.search_tasks import (
+    LEAST_AGREEMENT,
+    SearchTask,
+    _search_block,
+    block_size,
+)
 from semloc_logs.settings import load
 from semloc_logs.words.survey import Votes
 
@@ -35,7 +40,7 @@ def searched(
     """The queries that are searched, in turn; all that is found is returned."""
     order: list[int] = []
 
-    def search(keyframe: int) -> list[Any]:
+    def search(keyframe: int, least_agreement: float = 0.0) -> list[Any]:
         order.append(keyframe)
         return [found[keyframe]] if keyframe in found else []
 
@@ -82,6 +87,24 @@ def test_in_another_session_votes_are_more_than_chance_brings() -> None:
     assert searched(few, {}, MIN_VOTES) == []
     assert searched(more, {}, MIN_VOTES) == [10]
     assert searched(few, {}, MIN_VOTES, is_other=False) == [10]
+
+
+@pytest.mark.parametrize("is_other", [True, False])
+def test_the_first_query_alone_has_to_agree_about_a_place_of_another_session(
+    is_other: bool,
+) -> None:
+    searches: list[tuple[int, float]] = []
+
+    def search(keyframe: int, least_agreement: float = 0.0) -> list[Any]:
+        searches.append((keyframe, least_agreement))
+        return [alignment(keyframe, 0.03)]
+
+    least = LEAST_AGREEMENT if is_other else 0.0
+    _search_block(BLOCK, votes(9.0, 4.0, 5.0, 5.0), MIN_VOTES, search, is_other=is_other)
+    assert searches == [(10, least), (12, 0.0), (14, 0.0), (16, 0.0)]
+    searches.clear()
+    _search_block(BLOCK, votes(0.0, 0.0, 0.0, 0.0), 0.0, search, is_other=is_other)
+    assert searches == [(keyframe, 0.0) for keyframe in BLOCK]
 
 
 def test_all_are_searched_without_a_bound() -> None:
@@ -131,7 +154,14 @@ def searches_of(
         assert surveyed is not None
         return surveyed
 
-    def search(database: tuple[str, str], session: Any, keyframe: int, query: str) -> list[Any]:
+    def search(
+        database: tuple[str, str],
+        session: Any,
+        keyframe: int,
+        query: str,
+        *,
+        least_agreement: float,
+    ) -> list[Any]:
         target, words = database
         assert words == task.words[target]
         assert query == f"query {keyframe}"
