@@ -39,7 +39,7 @@ from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
-from semloc_logs.stages.inputs import SessionInput, session_name
+from semloc_logs.stages.inputs import Redo, SessionInput, session_name
 from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.run import run
@@ -233,7 +233,7 @@ class Workspace:
                 self._settled(writes=True, overwrite=overwrite),
                 engine,
                 annotation=mode,
-                overwrite=overwrite,
+                redo=Redo.of(overwrite=overwrite),
             )
 
     def fuse(
@@ -248,7 +248,7 @@ class Workspace:
         inputs = _inputs(logs, topics, poses)
         settings = self._settled(writes=True, overwrite=overwrite)
         with self._open_engine() as engine:
-            return fuse(inputs, self._folder, settings, engine, overwrite=overwrite)
+            return fuse(inputs, self._folder, settings, engine, redo=Redo.of(overwrite=overwrite))
 
     def describe(self, *sessions: str, overwrite: bool = False) -> Report:
         """Maps -> semantic words of ``sessions``, by default of all."""

@@ -42,6 +42,7 @@ def command(
     from semloc_logs.simulation.demo import simulate_demo
     from semloc_logs.simulation.meshes.world import require_ray_caster
     from semloc_logs.stages.annotate import AnnotationMode
+    from semloc_logs.stages.inputs import Redo
     from semloc_logs.stages.run import run
     from semloc_logs.stages.state import settle
     from semloc_logs.workspace import Workspace
@@ -64,7 +65,7 @@ def command(
                 settings,
                 opened,
                 annotation=AnnotationMode.COPY,
-                overwrite=overwrite,
+                redo=Redo.of(overwrite=overwrite),
             )
     result = evaluate_closures(workspace, truth, settings)
     if as_json:

@@ -65,22 +65,17 @@ def command(
     sessions = session_inputs(logs.joined(session), topics, poses)
     from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.fuse import fuse
+    from semloc_logs.stages.inputs import Redo
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
+    redo = Redo.of(overwrite=overwrite, retry_failed=retry_failed)
     with console.progress(), engine.open(len(sessions)) as opened:
         if dry_run:
             plan = Plan(workspace, settings)
-            plan.fuse(sessions, overwrite=overwrite, retry_failed=retry_failed)
+            plan.fuse(sessions, redo)
             return show_plan(plan, opened.jobs, as_json=as_json)
-        report = fuse(
-            sessions,
-            workspace,
-            settings,
-            opened,
-            overwrite=overwrite,
-            retry_failed=retry_failed,
-        )
+        report = fuse(sessions, workspace, settings, opened, redo=redo)
     if as_json:
         console.result_json(report_json(report, work))
     else:

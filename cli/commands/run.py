@@ -69,28 +69,22 @@ def command(
     sessions = session_inputs(logs.each(), topics, poses)
     from semloc_logs.stages.annotate import AnnotationMode
     from semloc_logs.stages.dry_run import Plan
+    from semloc_logs.stages.inputs import Redo
     from semloc_logs.stages.run import run
     from semloc_logs.stages.stored_sessions import list_sessions
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     mode = AnnotationMode(annotation)
+    redo = Redo.of(overwrite=overwrite, retry_failed=retry_failed)
     with console.progress(), engine.open(len(sessions)) as opened:
         if dry_run:
             plan = Plan(workspace, settings)
-            plan.fuse(sessions, overwrite=overwrite, retry_failed=retry_failed)
+            plan.fuse(sessions, redo)
             plan.describe(overwrite=False)
             plan.close(overwrite=overwrite)
             return show_plan(plan, opened.jobs, as_json=as_json)
-        report = run(
-            sessions,
-            workspace,
-            settings,
-            opened,
-            annotation=mode,
-            overwrite=overwrite,
-            retry_failed=retry_failed,
-        )
+        report = run(sessions, workspace, settings, opened, annotation=mode, redo=redo)
     if as_json:
         console.result_json(report_json(report, work))
     else:

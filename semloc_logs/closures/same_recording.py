@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -11,10 +11,11 @@ from semloc_logs.mapping.session_map import SessionMap
 # so many keyframes, or all of a shorter session, are the same measurements: equal stamps alone may
 # come from simulated time, which starts at zero in every session
 LEAST_SHARED = 3
+MOST_NAMES = 4  # in a sentence
 
 
 def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
-    """A sentence for each pair of sessions that share measurements.
+    """A sentence for each set of sessions that share measurements.
 
     Whether by the same file under two names, by a copy in another container, or by a part that both
     have: their keyframes have equal stamps, and points with the same mean.
@@ -24,7 +25,7 @@ def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
         for name, session in maps.items()
         if len(session.stamps_ns)
     )
-    texts = []
+    shared: dict[frozenset[str], int] = {}
     for number, (_, end_ns, first) in enumerate(spans):
         for start_ns, _, second in spans[number + 1 :]:
             if start_ns > end_ns:
@@ -32,13 +33,34 @@ def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
             least = min(LEAST_SHARED, *(len(maps[name].stamps_ns) for name in (first, second)))
             count = _shared(maps[first], maps[second])
             if count >= least:
-                names = " and ".join(sorted((first, second)))
-                texts.append(
-                    f"Sessions {names} are of one recording: {count} of their keyframes are the"
-                    " same measurements, and closures between these show nothing; give each"
-                    " recording once."
-                )
-    return sorted(texts)
+                shared[frozenset((first, second))] = count
+    return [
+        f"Sessions {_listed(names)} are of one recording: {_most(shared, names)} of their keyframes"
+        " are the same measurements, and closures between these show nothing; give each recording"
+        " once."
+        for names in _sets(shared)
+    ]
+
+
+def _sets(pairs: Iterable[frozenset[str]]) -> list[list[str]]:
+    """The sessions that hang together by ``pairs``, sorted."""
+    sets: list[set[str]] = []
+    for pair in pairs:
+        joined = [one for one in sets if one & pair]
+        sets = [one for one in sets if not one & pair] + [set(pair).union(*joined)]
+    return sorted(sorted(one) for one in sets)
+
+
+def _most(shared: Mapping[frozenset[str], int], names: Sequence[str]) -> int:
+    """The most keyframes that two of these sessions share."""
+    return max(count for pair, count in shared.items() if pair <= {*names})
+
+
+def _listed(names: Sequence[str]) -> str:
+    """All names, or the first ones of many."""
+    if len(names) <= MOST_NAMES:
+        return f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} others"
 
 
 def _shared(session: SessionMap, other: SessionMap) -> int:

@@ -18,7 +18,7 @@ from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.describe import plan_describe
 from semloc_logs.stages.fuse import plan_fuse
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.pair_search import (
     EVERYTHING,
     PairSearch,
@@ -69,12 +69,8 @@ class Plan:
         self._coming: dict[str, _Coming] = {}
         self._rates = {**USUAL_RATES, **measured_rates(work)}
 
-    def fuse(
-        self, sessions: Sequence[SessionInput], *, overwrite: bool, retry_failed: bool
-    ) -> None:
-        plan = plan_fuse(
-            sessions, self._work, self._settings, overwrite=overwrite, retry_failed=retry_failed
-        )
+    def fuse(self, sessions: Sequence[SessionInput], redo: Redo = Redo.NOTHING) -> None:
+        plan = plan_fuse(sessions, self._work, self._settings, redo=redo)
         coming = {task.folder.name: _coming(task) for task in plan.tasks}
         self.known_failures = plan.report.failed
         seconds = sum(one.seconds for one in coming.values())

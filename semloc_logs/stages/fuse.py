@@ -30,7 +30,7 @@ from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.logs.session.lent_transforms import lent_transforms
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.settings import Logs, Resolved
-from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
+from semloc_logs.stages.inputs import Redo, SessionInput, fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
@@ -59,25 +59,22 @@ def fuse(
     engine: Engine,
     *,
     names: Sequence[str] = (),
-    overwrite: bool = False,
-    retry_failed: bool = False,
+    redo: Redo = Redo.NOTHING,
 ) -> Report:
     """Fuse each session, or only ``names``. One that fails is named in ``failed``; the others
     go on.
 
-    The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.
+    The reason is kept, and the same log is not read again unless failed ones are to be redone.
     Raises LogError when all of them failed, WorkspaceError where another log has the name of a
-    session, unless ``overwrite``.
+    session, unless everything is to be redone.
     """
     chosen = [session for session in sessions if not names or session.name in names]
     with writing(work, [session.name for session in chosen]):
         for session in chosen:
             for log in session.logs:
                 recover(log)
-        plan = plan_fuse(
-            sessions, work, settings, names=names, overwrite=overwrite, retry_failed=retry_failed
-        )
-        keep(work, settings, overwrite=overwrite)
+        plan = plan_fuse(sessions, work, settings, names=names, redo=redo)
+        keep(work, settings, overwrite=redo is Redo.EVERYTHING)
         return _fuse(plan, work, engine)
 
 
@@ -87,19 +84,17 @@ def plan_fuse(
     settings: Resolved,
     *,
     names: Sequence[str] = (),
-    overwrite: bool = False,
-    retry_failed: bool = False,
+    redo: Redo = Redo.NOTHING,
 ) -> FusePlan:
     """What :func:`fuse` would do. Nothing is written."""
     plan = FusePlan()
-    again = overwrite or retry_failed
     logs = [log for session in sessions for log in session.logs]
     for session in sessions:
         if names and session.name not in names:
             continue
         others = [log for log in logs if log not in session.logs]
         folder = work.session(session.name)
-        present = {} if overwrite else _present(folder)
+        present = {} if redo is Redo.EVERYTHING else _present(folder)
         reading = _as_read_before(present, settings)
         task = _task(session, folder, reading, others)
         plan.report.skipped += _given_twice(task)
@@ -108,7 +103,10 @@ def plan_fuse(
             plan.report.skipped += present["skipped"]
             continue
         _check_same_log(task, present)
-        if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
+        if (
+            redo is Redo.NOTHING
+            and recorded_fingerprint(work.failure(session.name)) == task.fingerprint
+        ):
             reason = read_json(work.failure(session.name))["reason"]
             sentence = f"{reason} It failed before: --retry-failed reads it again."
             plan.report.failed.append(sentence)

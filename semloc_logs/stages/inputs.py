@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 
 import semloc_logs
@@ -23,6 +24,21 @@ class SessionInput:
     logs: tuple[Path, ...]
     topics: Mapping[str, str] = field(default_factory=dict)
     poses: TrajectoryFile | None = None
+
+
+class Redo(Enum):
+    """Which work of fusing is done again although it was done, or failed, before."""
+
+    NOTHING = "nothing"
+    FAILED = "failed"
+    EVERYTHING = "everything"
+
+    @staticmethod
+    def of(*, overwrite: bool = False, retry_failed: bool = False) -> Redo:
+        """By the options of a command; ``overwrite`` includes what failed."""
+        if overwrite:
+            return Redo.EVERYTHING
+        return Redo.FAILED if retry_failed else Redo.NOTHING
 
 
 def session_name(log: Path) -> str:

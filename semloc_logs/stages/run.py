@@ -16,7 +16,7 @@ from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.dry_run import measured_rates
 from semloc_logs.stages.fuse import fuse
-from semloc_logs.stages.inputs import SessionInput, session_name
+from semloc_logs.stages.inputs import Redo, SessionInput, session_name
 from semloc_logs.stages.lock import one_writer
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.report_page import write_report
@@ -34,19 +34,15 @@ def run(
     engine: Engine,
     *,
     annotation: AnnotationMode = AnnotationMode.NONE,
-    overwrite: bool = False,
-    retry_failed: bool = False,
+    redo: Redo = Redo.NOTHING,
 ) -> Report:
     """All of it, resumable: sessions are fused, and all of the workspace described and closed."""
     total = _Total(engine.jobs)
-    fused_now = fuse(
-        sessions, work, settings, engine, overwrite=overwrite, retry_failed=retry_failed
-    )
-    total.add("fuse", fused_now)
+    total.add("fuse", fuse(sessions, work, settings, engine, redo=redo))
     fused = [s for s in sessions if work.session(s.name).session_json.exists()]
     # of those that are fused again, words are made again
     total.add("describe", describe(work, [], settings, engine))
-    total.add("close", close(work, settings, engine, overwrite=overwrite))
+    total.add("close", close(work, settings, engine, overwrite=redo is Redo.EVERYTHING))
     if annotation is not AnnotationMode.NONE:
         for session in fused:
             _annotate_logs(session, work, settings, annotation)

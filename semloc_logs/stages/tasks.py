@@ -19,7 +19,7 @@ from semloc_logs.settings import Resolved
 from semloc_logs.stages.close import close, is_decided
 from semloc_logs.stages.describe import describe, plan_describe
 from semloc_logs.stages.fuse import fuse, plan_fuse
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.lock import searching
 from semloc_logs.stages.pair_search import PairSearch, pair_fingerprints
 from semloc_logs.stages.report import Report
@@ -64,7 +64,7 @@ def list_tasks(
     folder = work.path / "sessions"
     match stage:
         case Stage.FUSE:
-            kept = plan_fuse(sessions, work, settings, retry_failed=True).report.kept
+            kept = plan_fuse(sessions, work, settings, redo=Redo.FAILED).report.kept
             logs = {session.name: tuple(map(str, session.logs)) for session in sessions}
             return [StageTask(stage, n, logs[n[0]], n[0] in kept) for n in names]
         case Stage.DESCRIBE:
@@ -132,7 +132,7 @@ def do_task(
     settings: Resolved,
     engine: Engine,
     *,
-    retry_failed: bool = False,
+    redo: Redo = Redo.NOTHING,
 ) -> Report:
     """Do the task with this id, unless it is done; the sessions are needed to fuse.
 
@@ -148,7 +148,7 @@ def do_task(
                     f"None of the logs is session '{names[0]}': give the logs of all sessions, as"
                     f" for 'semloc tasks fuse'.{did_you_mean(names[0], known)}"
                 )
-            return fuse(sessions, work, settings, engine, names=names, retry_failed=retry_failed)
+            return fuse(sessions, work, settings, engine, names=names, redo=redo)
         case Stage.DESCRIBE:
             return describe(work, names, settings, engine)
         case Stage.SEARCH:

@@ -35,9 +35,9 @@ FAR_CODE = 32
 HEADING_BITS = 8
 CELL_BITS = 14
 WEIGHT_BITS = 11
-# in simulated towns of a kilometre 7 of 100 stretches of sessions that never meet have more votes
-# than that by chance, and all of 72 stretches of those that do
-CHANCE = 0.25
+# in six simulated towns of ten kilometres 23 of 100 stretches of sessions that never meet have more
+# votes than that by chance, and 1,243 of 1,248 stretches within 5 m of the other session's road
+CHANCE = 0.3
 KILOMETRE = 12  # submaps of so much road
 
 

@@ -20,6 +20,7 @@ from semloc_logs.benchmarks.named import Outcome
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
+from semloc_logs.stages.inputs import Redo
 from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.tables import contracts
@@ -192,7 +193,7 @@ def test_run_makes_each_log_a_session(called: Any, tmp_path: Path) -> None:
     ]
     assert seen["settings"].query.frames == 3
     assert seen["settings"].fusion.max_range == 50.0  # resolved
-    assert (seen["annotation"], seen["overwrite"]) == ("copy", True)
+    assert (seen["annotation"], seen["redo"]) == ("copy", Redo.EVERYTHING)
     assert "0.9987" in done.stdout
     assert f"2 loop closures in {tmp_path / 'work/closures.parquet'}" in done.stdout
     assert "fuse 1.2 s" in done.stdout

@@ -47,6 +47,17 @@ def test_sessions_of_one_recording_are_named(a: Any, b: Any, count: int) -> None
     )
 
 
+def test_many_copies_are_one_sentence() -> None:
+    """Five copies and a part of one of them; two copies of another recording."""
+    maps = {name: session(0, 20) for name in "fecba"} | {"d": session(15, 40)}
+    maps |= {name: session(0, 9, seed=1) for name in "yx"}
+    first, second = same_recordings(maps)
+    assert first.startswith(
+        "Sessions a, b, c, d and 2 others are of one recording: 20 of their keyframes are"
+    )
+    assert second.startswith("Sessions x and y are of one recording: 9 of their keyframes are")
+
+
 def test_sessions_of_earlier_versions_are_not_compared() -> None:
     old = SimpleNamespace(stamps_ns=np.arange(20) * S, view_means=list)
     assert same_recordings({"a": cast(Any, old), "b": cast(Any, old)}) == []

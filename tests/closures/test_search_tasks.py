@@ -76,14 +76,14 @@ def test_in_a_small_map_fewer_votes_are_enough() -> None:
 
 
 def test_votes_by_chance_by_hand() -> None:
-    assert Votes(9.0, 400.0, 12).by_chance == 5.0
-    assert Votes(9.0, 400.0, 3).by_chance == 5.0  # a short map
-    assert Votes(9.0, 400.0, 48).by_chance == 2.5  # four kilometres
+    assert Votes(9.0, 400.0, 12).by_chance == 6.0
+    assert Votes(9.0, 400.0, 3).by_chance == 6.0  # a short map
+    assert Votes(9.0, 400.0, 48).by_chance == 3.0  # four kilometres
     assert Votes(0.0, 0.0, 0).by_chance == 0.0
 
 
 def test_in_another_session_votes_are_more_than_chance_brings() -> None:
-    few, more = (votes(v, 0.0, 0.0, 0.0, everywhere=400.0) for v in (4.9, 5.0))
+    few, more = (votes(v, 0.0, 0.0, 0.0, everywhere=400.0) for v in (5.9, 6.0))
     assert searched(few, {}, MIN_VOTES) == []
     assert searched(more, {}, MIN_VOTES) == [10]
     assert searched(few, {}, MIN_VOTES, is_other=False) == [10]

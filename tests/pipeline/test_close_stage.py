@@ -27,7 +27,7 @@ from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
 from semloc_logs.stages import pair_search
 from semloc_logs.stages import run as run_stage
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import read_json, read_metadata, write_json
@@ -141,7 +141,7 @@ def test_other_words_of_a_session_are_closed(
 ) -> None:
     """The settings stay; another log makes other words."""
     other = SessionInput("monday", (drives["wednesday"].log,))
-    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial(), overwrite=True)
+    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial(), redo=Redo.EVERYTHING)
     with pytest.raises(WorkspaceError, match="monday lacks semantic words of its present map"):
         close()
     describe_stage.describe(coarse, [], tools.coarse_settings(), Serial())

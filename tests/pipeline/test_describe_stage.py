@@ -18,7 +18,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
 from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.workspace import Workspace
@@ -112,7 +112,7 @@ def test_a_session_that_was_fused_from_another_log_is_described(
     describe: Describe, coarse: Workspace, drives: Any, tools: SimpleNamespace
 ) -> None:
     other = SessionInput("monday", (drives["wednesday"].log,))
-    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial(), overwrite=True)
+    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial(), redo=Redo.EVERYTHING)
     assert describe().done == ["monday"]
 
 

@@ -35,7 +35,7 @@ from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Logs, Resolved, Settings, load
 from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.stages import fuse as fuse_stage
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.workspace import Workspace
@@ -59,7 +59,9 @@ def fuse(tools: SimpleNamespace, drives: Any, coarse: Workspace) -> Fuse:
         monday = tuple(logs or [drives["monday"].log])
         session = SessionInput("monday", monday, topics or {}, poses)
         settings = settings or tools.coarse_settings()
-        return fuse_stage.fuse([session], coarse, settings, Serial(), overwrite=overwrite)
+        return fuse_stage.fuse(
+            [session], coarse, settings, Serial(), redo=Redo.of(overwrite=overwrite)
+        )
 
     return again
 
@@ -367,7 +369,7 @@ def test_a_log_that_failed_is_read_again_when_it_or_the_settings_change_or_on_de
     second, reads = fuse_again()
     assert (second.kept, reads) == (["monday"], 0)
     assert second.failed == [f"{first.failed[0]} It failed before: --retry-failed reads it again."]
-    assert fuse_again(retry_failed=True)[1] == 1
+    assert fuse_again(redo=Redo.FAILED)[1] == 1
     log.write_bytes(b"still no log")
     assert fuse_again()[1] == 1
     assert fuse_again()[1] == 0
@@ -668,3 +670,9 @@ def test_workers_in_another_folder_find_the_log_and_the_workspace(
     [task] = fuse_stage.plan_fuse([session], Workspace(Path("w")), Settings().resolved()).tasks
     assert task.logs == (tmp_path / "a.mcap",)
     assert task.folder.path == Workspace(tmp_path / "w").session("a").path
+
+
+def test_overwriting_includes_what_failed() -> None:
+    options = [(True, True), (True, False), (False, True), (False, False)]
+    chosen = [Redo.of(overwrite=o, retry_failed=r) for o, r in options]
+    assert chosen == [Redo.EVERYTHING, Redo.EVERYTHING, Redo.FAILED, Redo.NOTHING]

@@ -16,7 +16,7 @@ from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.stages.dry_run import Plan, PlannedStage, measured_rates
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.run import run
 from semloc_logs.workspace import Workspace
 
@@ -32,7 +32,7 @@ def semloc(*args: object) -> Result:
 def test_all_of_a_run_is_planned(tools: SimpleNamespace, drives: Any, tmp_path: Path) -> None:
     work = Workspace(tmp_path / "work")
     plan = Plan(work, tools.coarse_settings())
-    plan.fuse(tools.inputs(drives, "tuesday", "monday"), overwrite=False, retry_failed=False)
+    plan.fuse(tools.inputs(drives, "tuesday", "monday"))
     plan.describe(overwrite=False)
     plan.close(overwrite=False)
     pairs = ["monday in monday", "tuesday in monday", "tuesday in tuesday"]
@@ -52,7 +52,7 @@ def test_one_more_log_is_searched_in_the_others(
     sessions = tools.inputs(drives, *drives)
     before = tools.write_times(coarse.path)
     plan = Plan(coarse, settings)
-    plan.fuse(sessions, overwrite=False, retry_failed=False)
+    plan.fuse(sessions)
     plan.describe(overwrite=False)
     plan.close(overwrite=False)
     assert tools.write_times(coarse.path) == before
@@ -70,7 +70,7 @@ def test_one_more_log_is_searched_in_the_others(
     assert set(measured_rates(coarse)) == {"fuse", "describe", "close"}
 
     again = Plan(coarse, settings)
-    again.fuse(sessions, overwrite=False, retry_failed=False)
+    again.fuse(sessions)
     again.describe(overwrite=False)
     again.close(overwrite=False)
     assert planned(again) == {"fuse": ([], 3), "describe": ([], 3), "close": ([], 6)}
@@ -95,7 +95,7 @@ def test_amounts_and_seconds_by_hand(tools: SimpleNamespace, drives: Any, tmp_pa
 
     def plan_in(work: Workspace) -> dict[str, PlannedStage]:
         plan = Plan(work, settings)
-        plan.fuse(sessions, overwrite=False, retry_failed=False)
+        plan.fuse(sessions)
         plan.describe(overwrite=False)
         plan.close(overwrite=False)
         return stages_of(plan)
@@ -122,7 +122,7 @@ def test_a_log_that_cannot_be_opened_makes_no_session(
     broken.write_bytes(b"not a log")
     plan = Plan(Workspace(tmp_path / "work"), tools.coarse_settings())
     sessions = [SessionInput("broken", (broken,)), *tools.inputs(drives, "monday")]
-    plan.fuse(sessions, overwrite=False, retry_failed=False)
+    plan.fuse(sessions)
     plan.describe(overwrite=False)
     plan.close(overwrite=False)
     assert planned(plan) == {
@@ -143,7 +143,7 @@ def test_all_is_planned_again_with_overwrite(
     assert planned(alone) == {"close": (pairs, 3)}
 
     plan = Plan(coarse, settings)
-    plan.fuse(tools.inputs(drives, "tuesday"), overwrite=True, retry_failed=False)
+    plan.fuse(tools.inputs(drives, "tuesday"), Redo.EVERYTHING)
     plan.describe(overwrite=True)
     plan.close(overwrite=True)
     assert planned(plan) == {
@@ -158,7 +158,7 @@ def test_the_later_recorded_session_is_the_query_whatever_its_name(
 ) -> None:
     plan = Plan(coarse, tools.coarse_settings())
     sessions = [SessionInput("a", (drives["wednesday"].log,))]
-    plan.fuse(sessions, overwrite=False, retry_failed=False)
+    plan.fuse(sessions)
     plan.close(overwrite=False)
     pairs = ["a in monday", "a in tuesday", "a in a"]
     assert planned(plan)["close"] == (pairs, 6)

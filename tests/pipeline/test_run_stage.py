@@ -11,7 +11,7 @@ from semloc_logs.engines import Serial
 from semloc_logs.settings import Settings
 from semloc_logs.stages import run as run_stage
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
@@ -31,7 +31,7 @@ def test_a_run_goes_on_where_it_was(
             tools.coarse_settings(),
             Serial(),
             annotation=AnnotationMode(annotation),
-            overwrite=overwrite,
+            redo=Redo.of(overwrite=overwrite),
         )
 
     tables = tools.files(coarse.path)
@@ -72,7 +72,7 @@ def test_a_log_that_cannot_be_read_does_not_stop_the_others(
             tools.coarse_settings(),
             Serial(),
             annotation=AnnotationMode.COPY,
-            retry_failed=retry_failed,
+            redo=Redo.of(retry_failed=retry_failed),
         )
 
     [sentence] = run().failed

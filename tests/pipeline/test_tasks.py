@@ -16,7 +16,7 @@ from semloc_logs.cli.main import program
 from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.engines import Serial
 from semloc_logs.errors import LogError, SettingsError, WorkspaceError
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.stages.tasks import Stage, do_task, list_tasks, parse_task
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
@@ -210,9 +210,9 @@ def test_a_task_reads_a_failed_log_again_when_told_so(
     sessions = [SessionInput("bad", (bad,))]
     written = []
     settings = tools.coarse_settings()
-    for again in (False, False, True):
+    for redo in (Redo.NOTHING, Redo.NOTHING, Redo.FAILED):
         with pytest.raises(LogError, match=r"bad\.mcap is not a log"):
-            do_task("fuse/bad", sessions, work, settings, Serial(), retry_failed=again)
+            do_task("fuse/bad", sessions, work, settings, Serial(), redo=redo)
         written.append(work.failure("bad").stat().st_mtime_ns)
     assert written[0] == written[1] < written[2]
     [task] = list_tasks(Stage.FUSE, sessions, work, settings)

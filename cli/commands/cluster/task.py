@@ -86,6 +86,7 @@ def command(
     if step is not None and (index is None or index >= step):
         raise click.UsageError("--of N needs an --index below N.")
     from semloc_logs.engines import Serial
+    from semloc_logs.stages.inputs import Redo
     from semloc_logs.stages.tasks import Stage, do_task, task_ids
     from semloc_logs.workspace import Workspace
 
@@ -97,14 +98,13 @@ def command(
         tasks = listed[index::step] if step else listed[index : index + 1]
         if not step and not tasks:
             raise click.UsageError(f"{task} has {len(listed)} tasks; --index counts from 0.")
+    redo = Redo.of(retry_failed=retry_failed)
     reports: list[dict[str, Any]] = []
     codes = {0}
     with console.progress():
         for one in tasks:
             try:
-                report = do_task(
-                    one, sessions, workspace, settings, Serial(), retry_failed=retry_failed
-                )
+                report = do_task(one, sessions, workspace, settings, Serial(), redo=redo)
             except (SemlocError, OSError, MemoryError) as problem:
                 if isinstance(problem, SettingsError):
                     raise
