@@ -1,11 +1,12 @@
 """Phrases that readers stumble over, in code and documents; exit code 1 if there are any.
 
 Only comments, docstrings, texts and Markdown count; code in Markdown does not. CONTRIBUTING.md
-lists what to write instead.
+lists what to write instead. Local names in the package that do not say what a value is count, too.
 """
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import subprocess
@@ -25,6 +26,8 @@ PHRASES = {
     r"\bsuch as are\b": "say which",
     r"\bstreets that look like others\b": "ambiguous places",
 }
+EMPTY_NAMES = {"found", "at", "near", "said", "mine", "much"}  # of values, in functions
+OPTIONS = "cli/commands/"  # parameters there are options of users
 PATTERN = re.compile("|".join(f"(?:{phrase})" for phrase in PHRASES))
 
 
@@ -44,6 +47,19 @@ def texts_of(path: Path) -> Iterator[tuple[int, str]]:
                 yield token.start[0] + offset, line
 
 
+def empty_names(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines of functions that give a value an empty name, and the name."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    functions = (n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+    nodes = {id(node): node for function in functions for node in ast.walk(function)}
+    for node in nodes.values():
+        if isinstance(node, ast.arg) and node.arg in EMPTY_NAMES and OPTIONS not in str(path):
+            yield node.lineno, node.arg
+        is_stored = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        if is_stored and node.id in EMPTY_NAMES:
+            yield node.lineno, node.id
+
+
 def main() -> int:
     """Print every occurrence; their number decides the exit code."""
     listed = subprocess.run(
@@ -52,16 +68,20 @@ def main() -> int:
         text=True,
         check=True,
     )
-    found = 0
+    count = 0
     for name in listed.stdout.split():
         path = Path(name)
         if not path.exists():
             continue
         for number, line in texts_of(path):
             if match := PATTERN.search(line):
-                found += 1
+                count += 1
                 print(f"{name}:{number}: '{match.group(0).strip()}': {line.strip()[:90]}")
-    return int(found > 0)
+        if name.startswith(("semloc_logs/", "cli/")) and path.suffix == ".py":
+            for number, word in empty_names(path):
+                count += 1
+                print(f"{name}:{number}: '{word}' does not say what the value is")
+    return int(count > 0)
 
 
 if __name__ == "__main__":

@@ -160,12 +160,12 @@ def _expanded(text: str) -> list[Path]:
 
 def _matches(pattern: RemotePath) -> list[Path]:
     """The files on a server that a pattern matches; itself where it is the name of one."""
-    found = pattern.matches()
-    if not found and pattern.exists():
+    matches = pattern.matches()
+    if not matches and pattern.exists():
         return [pattern]
-    if not found:
+    if not matches:
         raise click.UsageError(f"{pattern} matches no file.")
-    return list(found)
+    return list(matches)
 
 
 def _listed(manifest: Path) -> Iterator[Entry]:

@@ -71,8 +71,8 @@ class Program(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f".commands.{COMMANDS[cmd_name][0]}", __package__)
-        found: click.Command = module.command
-        return found
+        loaded: click.Command = module.command
+        return loaded
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

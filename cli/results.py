@@ -114,12 +114,12 @@ def show_closures(work: Workspace) -> None:
         (
             query,
             "itself" if target == query else target,
-            len(found),
-            _seconds(found, "query"),
-            f"{min(row['overlap'] for row in found):.2f}",
-            f"{min(row['probability'] for row in found):.4f}",
+            len(closures),
+            _seconds(closures, "query"),
+            f"{min(row['overlap'] for row in closures):.2f}",
+            f"{min(row['probability'] for row in closures):.4f}",
         )
-        for (query, target), found in sorted(pairs.items(), key=lambda p: (-len(p[1]), p[0]))
+        for (query, target), closures in sorted(pairs.items(), key=lambda p: (-len(p[1]), p[0]))
     ]
     if drawn:
         columns = ("query", "in", "closures#", "over (s)", "overlap from#", "probability from#")

@@ -63,5 +63,5 @@ class TruthError(SemlocError):
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A sentence with the known word that is spelled most like ``word``; empty if none is."""
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f" Did you mean '{near[0]}'?" if near else ""
+    similar = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f" Did you mean '{similar[0]}'?" if similar else ""

@@ -116,27 +116,28 @@ def command(
             )
             with closing(shards):
                 run = TrainingRun(where, device=chosen, deadline=deadline, snapshots=snapshots)
-                found = learn_descriptor(name, shards, settings, run, weights, console.note)
-            if found is None:
+                learned = learn_descriptor(name, shards, settings, run, weights, console.note)
+            if learned is None:
                 opened.stop()  # scenes that are being made are made again
                 console.warn(
                     f"{minutes:g} minutes are over and {where} is written: the same command goes"
                     " on from there."
                 )
                 return 3
-            scores[name] = found
+            scores[name] = learned
             console.note(f"{weights} written")
     if as_json:
         console.result_json(
             {
-                name: {"weights": str(output / f"{name}.safetensors"), **found}
-                for name, found in scores.items()
+                name: {"weights": str(output / f"{name}.safetensors"), **learned}
+                for name, learned in scores.items()
             }
         )
     else:
-        figures = sorted({figure for found in scores.values() for figure in found})
+        figures = sorted({figure for learned in scores.values() for figure in learned})
         rows = [
-            (figure, *(f"{found[figure]:.4f}" for found in scores.values())) for figure in figures
+            (figure, *(f"{learned[figure]:.4f}" for learned in scores.values()))
+            for figure in figures
         ]
         console.table("On two held-out scenes", ("figure", *(f"{name}#" for name in scores)), rows)
         for name in scores:

@@ -219,7 +219,7 @@ def closest(
     cy = y >> 2
     cz = z >> 2
     best = bound
-    found = (0, 0, 0)
+    nearest = (0, 0, 0)
     for m in range(len(offset)):
         if least[m] >= best:
             break
@@ -234,8 +234,8 @@ def closest(
             continue
         best, bit = closest_in_cube(cells, (x, y, z), point, best)
         if bit >= 0:
-            found = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
-    return best, found[0], found[1], found[2]
+            nearest = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
+    return best, nearest[0], nearest[1], nearest[2]
 
 
 @njit(cache=True, nogil=True)

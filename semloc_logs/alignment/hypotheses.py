@@ -120,10 +120,10 @@ def non_maximum_suppression(groups: I64, poses: F64, distance: float, most: int)
             break
         beside = False
         for k in kept[:count]:
-            near = groups[i] == groups[k]
+            is_beside = groups[i] == groups[k]
             for axis in range(1, 4):
-                near = near and abs(poses[i, axis] - poses[k, axis]) < distance
-            if near and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(SAME_HEADING):
+                is_beside = is_beside and abs(poses[i, axis] - poses[k, axis]) < distance
+            if is_beside and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(SAME_HEADING):
                 beside = True
                 break
         if not beside:

@@ -241,7 +241,7 @@ def best_overlaps(
         upper = _upper_bounds(target.arrays, cells, query.bits, group.whole, needed, offsets)
         bounds += [(-int(u), number, row) for row, u in enumerate(upper) if u >= needed]
     bounds.sort()
-    found: list[tuple[int, int, int]] = []
+    overlaps: list[tuple[int, int, int]] = []
     for negative, number, row in bounds:
         if -negative < needed:
             break
@@ -250,9 +250,9 @@ def best_overlaps(
         aligned = _count(target.arrays, points, query.bits, needed, offsets)
         if aligned < 0:
             continue
-        found.append((-aligned, number, row))
-        if len(found) >= 2 * most or (len(found) >= most and aligned > needed):
-            found = sorted(found)[:most]
+        overlaps.append((-aligned, number, row))
+        if len(overlaps) >= 2 * most or (len(overlaps) >= most and aligned > needed):
+            overlaps = sorted(overlaps)[:most]
             # an equal one that comes later by number would not displace the last
-            needed = max(needed, -found[-1][0])
-    return [Ranked(number, row, -a / n) for a, number, row in sorted(found)[:most]]
+            needed = max(needed, -overlaps[-1][0])
+    return [Ranked(number, row, -a / n) for a, number, row in sorted(overlaps)[:most]]

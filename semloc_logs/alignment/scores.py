@@ -148,8 +148,8 @@ def _count(grid: Arrays, centres: F64, bits: U8, grid_T_structure: F64) -> tuple
             R[2, 0] * centres[n, 0] + R[2, 1] * centres[n, 1] + R[2, 2] * centres[n, 2] + t[2]
         )
         if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-            found = mask[int(x), int(y), int(z)]
-            observed += found != 0
-            aligned += (found & bits[n]) != 0
-            free += (found & FREE_BIT) != 0
+            states = mask[int(x), int(y), int(z)]
+            observed += states != 0
+            aligned += (states & bits[n]) != 0
+            free += (states & FREE_BIT) != 0
     return observed, aligned, free

@@ -169,7 +169,7 @@ def _closest_around(
 ) -> int:
     """State of the observed cell closest to ``point``, which lies in ``cell``."""
     offset, least = offsets
-    found = UNOBSERVED_STATE
+    nearest = UNOBSERVED_STATE
     best = reach**2
     for m in range(len(offset)):
         if least[m] >= best:
@@ -191,8 +191,10 @@ def _closest_around(
             continue
         best, bit = closest_in_cube(observed, (x, y, z), point, best)
         if bit >= 0:
-            found = state[CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3)]
-    return found
+            nearest = state[
+                CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3)
+            ]
+    return nearest
 
 
 @njit(cache=True, nogil=True)

@@ -87,11 +87,11 @@ def write_part(
     path: Path,
     keyframes: Sequence[int],
     targets: dict[str, str],
-    found: Sequence[Alignment],
+    alignments: Sequence[Alignment],
 ) -> None:
     """The alignments of the queries at ``keyframes`` in all ``targets``."""
-    table = alignment_table(found)
-    names = pa.array([a.target_session for a in found], pa.string())
+    table = alignment_table(alignments)
+    names = pa.array([a.target_session for a in alignments], pa.string())
     metadata = {"keyframes": list(keyframes), "targets": targets}
     write_table(path, table.append_column(TARGET, names), metadata)
 

@@ -71,7 +71,7 @@ def search_queries(task: SearchTask) -> int:
     queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
     least_votes = min_votes(session, task.settings)
     votes = survey_queries(task, session, queries) if least_votes > 0 else {k: {} for k in queries}
-    found: list[Alignment] = []
+    alignments: list[Alignment] = []
     for target in task.targets:
 
         def search(
@@ -84,10 +84,10 @@ def search_queries(task: SearchTask) -> int:
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
         is_other = target != task.session
         for block in _blocks(task.keyframes, block_size(task.settings)):
-            found += _search_block(block, of_target, least_votes, search, is_other=is_other)
-    found.sort(key=lambda a: (a.query_keyframe, a.target_session))
-    write_part(task.output, task.keyframes, task.targets, found)
-    return len(found)
+            alignments += _search_block(block, of_target, least_votes, search, is_other=is_other)
+    alignments.sort(key=lambda a: (a.query_keyframe, a.target_session))
+    write_part(task.output, task.keyframes, task.targets, alignments)
+    return len(alignments)
 
 
 def min_votes(session: SessionMap, settings: Resolved) -> float:
@@ -135,17 +135,17 @@ def _search_block(
         enough = max(enough, votes[first].by_chance)
     if votes[first].place <= 0 or votes[first].place < enough:
         return []
-    found = search(first, LEAST_AGREEMENT if is_other else 0.0)
-    if _may_be_right(found):
+    alignments = search(first, LEAST_AGREEMENT if is_other else 0.0)
+    if _may_be_right(alignments):
         for keyframe in block:
             if keyframe != first:
-                found += search(keyframe)
-    return found
+                alignments += search(keyframe)
+    return alignments
 
 
-def _may_be_right(found: Sequence[Alignment]) -> bool:
+def _may_be_right(alignments: Sequence[Alignment]) -> bool:
     """Whether some alignment is worth the vote of a neighbour."""
-    probabilities = (probability_of(shipped().own_log_odds(a.features)) for a in found)
+    probabilities = (probability_of(shipped().own_log_odds(a.features)) for a in alignments)
     return any(float(p) >= MIN_PROBABILITY for p in probabilities)
 
 

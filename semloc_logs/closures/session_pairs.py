@@ -53,13 +53,13 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
 
 def known_pairs(work: Workspace) -> dict[Pair, str]:
     """The pairs whose alignments are there, with the fingerprints of what they were made from."""
-    found: dict[Pair, str] = {}
+    pairs: dict[Pair, str] = {}
     for path in (work.path / "alignments").glob("query=*/target=*/alignments.parquet"):
         query, target = (
             folder.name.partition("=")[2] for folder in (path.parent.parent, path.parent)
         )
-        found |= known_pair(work, Pair(query, target))
-    return found
+        pairs |= known_pair(work, Pair(query, target))
+    return pairs
 
 
 def known_pair(work: Workspace, pair: Pair) -> dict[Pair, str]:
@@ -134,10 +134,10 @@ def missing(
 def finish(work: Workspace, done: Missing, metadata: Mapping[str, Mapping[str, object]]) -> None:
     """Parts of all chunks -> a table for each target, with its metadata; the parts are removed."""
     queries = sum(len(chunk) for chunk in done.chunks)
-    found = {part.path: by_target(part.path) for part in done.parts}
+    tables = {part.path: by_target(part.path) for part in done.parts}
     for target, fingerprint in done.fingerprints.items():
         content = {**metadata[target], "fingerprint": fingerprint, "queries": queries}
-        of_parts = (found[part.path].get(target) for part in done.of(target))
+        of_parts = (tables[part.path].get(target) for part in done.of(target))
         table = joined(t for t in of_parts if t is not None)
         write_table(work.alignments(done.session, target), table, content, ("query_keyframe",))
     shutil.rmtree(done.folder, ignore_errors=True)

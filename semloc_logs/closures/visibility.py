@@ -176,10 +176,10 @@ def visible_to(database: Database, session: SessionMap, keyframe: int) -> Visibi
     closures = database.settings.closures
     time_ns = np.abs(session.stamps_ns - session.stamps_ns[keyframe])
     road = np.abs(session.distance - session.distance[keyframe])
-    near = (time_ns < closures.exclude_seconds * 1e9) | (road < closures.exclude_distance)
-    near[keyframe] = True
+    is_excluded = (time_ns < closures.exclude_seconds * 1e9) | (road < closures.exclude_distance)
+    is_excluded[keyframe] = True
 
     # whole stretches, so that several queries share maps without them
     stretch = session.distance // (SQUARE_VOXELS * database.settings.fusion.voxel_size)
-    hidden = np.isin(stretch, stretch[near]) | (not session.posed)
+    hidden = np.isin(stretch, stretch[is_excluded]) | (not session.posed)
     return Visibility(database, {name: hidden}, origin)

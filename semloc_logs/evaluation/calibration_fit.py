@@ -106,8 +106,8 @@ def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) 
     rows = rows & judged.clear & (agreement.neighbours > 0) & ~judged.copies
     values = Votes.of(agreement).vector()[rows]
     fitted = fit_signed(values, judged.right[rows], VOTE_SIGNS, offset=own[rows])
-    near, against, far, far_against = fitted.weights
-    return replace(fitted, weights=(near, against, far, min(far_against, -AGAINST * far)))
+    for_votes, against, far, far_against = fitted.weights
+    return replace(fitted, weights=(for_votes, against, far, min(far_against, -AGAINST * far)))
 
 
 def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:

@@ -93,13 +93,13 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
     )
     n = len(rows)
     road, target_road = np.zeros((2, n))
-    own, at = np.zeros((2, n, 4, 4))
+    own, map_T_query = np.zeros((2, n, 4, 4))
     for (query, target), of_pair in rows.by_pair():
         ends = (rows.query_keyframe[of_pair], rows.target_keyframe[of_pair])
         road[of_pair] = maps[query].distance[ends[0]]
         target_road[of_pair] = maps[target].distance[ends[1]]
         own[of_pair] = maps[query].map_T_base[ends[0]]
-        at[of_pair] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[of_pair]
+        map_T_query[of_pair] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[of_pair]
     query_session, target_session = rows.sessions()
     columns: dict[str, Any] = {
         "query_session": query_session.tolist(),
@@ -115,7 +115,7 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
         **_errors(rows, tracks),
     }
     columns |= {f"own_{i}{j}": own[:, i, j] for i in range(3) for j in range(4)} | {
-        f"at_{i}{j}": at[:, i, j] for i in range(3) for j in range(4)
+        f"at_{i}{j}": map_T_query[:, i, j] for i in range(3) for j in range(4)
     }
     metadata = {k: read_metadata(work.rejected).get(k) for k in ("voxel_size", "queries")}
     write_table(output, pa.table(columns), metadata | {"town": town})
@@ -135,9 +135,9 @@ def _errors(rows: Alignments, tracks: Mapping[str, TrueTrack]) -> dict[str, pa.A
         target_pose, target_known = tracks[target].at(rows.target_stamp_ns[of_pair])
         known[of_pair] = query_known & target_known
         true = inverse(target_pose) @ query_pose
-        found = rows.target_T_query[of_pair]
-        error[of_pair, :3] = found[:, :3, 3] - true[:, :3, 3]
-        turned = found[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)
+        measured = rows.target_T_query[of_pair]
+        error[of_pair, :3] = measured[:, :3, 3] - true[:, :3, 3]
+        turned = measured[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)
         error[of_pair, 3:] = Rotation.from_matrix(turned).as_rotvec()
 
     error_m = np.linalg.norm(error[:, :3], axis=1)

@@ -210,10 +210,10 @@ def judge_closure(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Ju
     ]
     error_m = error_deg = correct = None
     if ends[0] is not None and ends[1] is not None:
-        found = transform(
+        measured = transform(
             np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"])
         )
-        rest = inverse(inverse(ends[1]) @ ends[0]) @ found
+        rest = inverse(inverse(ends[1]) @ ends[0]) @ measured
         error_m = float(np.linalg.norm(rest[:3, 3]))
         error_deg = float(np.degrees(rotation_angle(rest[:3, :3])))
         correct = error_m <= CORRECT_M and error_deg <= CORRECT_DEG
@@ -271,9 +271,9 @@ def _pairs(rows: list[Judged], counts: _Counts) -> list[PairFigures]:
     return [
         PairFigures(
             pair,
-            closures=len(found := judged.get(pair, [])),
-            correct=sum(r.correct is True for r in found),
-            false=sum(r.correct is False for r in found),
+            closures=len(closures := judged.get(pair, [])),
+            correct=sum(r.correct is True for r in closures),
+            false=sum(r.correct is False for r in closures),
             possible=counts.possible_of[pair],
             answered=counts.answered_of[pair],
         )
@@ -315,8 +315,8 @@ class _Revisits:
         here = self.positions[name][keyframe]
         if self.heading_deg is None:
             return bool(self.trees[other].query(here)[0] <= REVISIT_M)
-        near = self.trees[other].query_ball_point(here, REVISIT_M)
-        return self.fits(name, keyframe, self.headings[other][self.known[other]][near])
+        neighbours = self.trees[other].query_ball_point(here, REVISIT_M)
+        return self.fits(name, keyframe, self.headings[other][self.known[other]][neighbours])
 
     def fits(self, name: str, keyframe: int, headings: F64) -> bool:
         """Whether there are headings (n,), and all are at the angle to a keyframe."""
@@ -342,14 +342,14 @@ def _count_queries(
             if not known[name][k]:
                 continue
             counts.queries += 1
-            near = [
+            candidates = [
                 other
                 for other in revisits.trees
                 if other != name and revisits.is_near(name, k, other)
             ]
             if self_closures and _revisits_itself(session, revisits, name, k, settings.closures):
-                near.append(name)
-            if not near:
+                candidates.append(name)
+            if not candidates:
                 continue
             answered_in = {
                 other
@@ -358,7 +358,7 @@ def _count_queries(
             }
             counts.possible += 1
             counts.answered += bool(answered_in)
-            pairs = {_pair(name, other) for other in near}
+            pairs = {_pair(name, other) for other in candidates}
             counts.possible_of.update(pairs)
             counts.answered_of.update(pairs & {_pair(name, other) for other in answered_in})
     return counts
@@ -379,8 +379,8 @@ def _correct_ends(
             )
             for session, stamp, other, is_query in ends:
                 keyframe = int(np.argmin(np.abs(sessions[session].stamps_ns - stamp)))
-                found = out.setdefault(session, {}).setdefault(other, [])
-                found.append((keyframe, is_query))
+                of_pair = out.setdefault(session, {}).setdefault(other, [])
+                of_pair.append((keyframe, is_query))
     return out
 
 
@@ -409,12 +409,12 @@ def _revisits_itself(
         return False
     positions = revisits.positions[name]
     away = np.linalg.norm(positions - positions[keyframe], axis=1)
-    near = revisits.known[name] & (away <= REVISIT_M)
+    is_revisit = revisits.known[name] & (away <= REVISIT_M)
     later = (
         np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
     )
     farther = np.abs(session.distance - session.distance[keyframe]) >= (closures.exclude_distance)
-    return revisits.fits(name, keyframe, revisits.headings[name][near & later & farther])
+    return revisits.fits(name, keyframe, revisits.headings[name][is_revisit & later & farther])
 
 
 # -- files

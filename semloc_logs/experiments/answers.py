@@ -306,19 +306,19 @@ def answers_of(tables: Sequence[pa.Table], fit: Spent | None = None) -> Answers:
     names = table["query"].to_pylist()
     queries = sorted(set(names))
     row = {name: k for k, name in enumerate(queries)}
-    at = np.array([row[name] for name in names], np.int64)
+    owner = np.array([row[name] for name in names], np.int64)
     rank = table["rank"].to_numpy()
-    found = rank > 0
-    place = (at[found], rank[found] - 1)
+    is_answered = rank > 0
+    place = (owner[is_answered], rank[is_answered] - 1)
     count = len(queries)
 
     def by_rank(column: str, missing: float) -> F64:
         out = np.full((count, MOST_POSES), missing)
-        out[place] = table[column].to_numpy()[found]
+        out[place] = table[column].to_numpy()[is_answered]
         return out
 
     trial = [""] * count
-    for name, number in zip(table["trial"].to_pylist(), at.tolist(), strict=True):
+    for name, number in zip(table["trial"].to_pylist(), owner.tolist(), strict=True):
         trial[number] = name
     return Answers(
         queries=queries,
@@ -326,15 +326,15 @@ def answers_of(tables: Sequence[pa.Table], fit: Spent | None = None) -> Answers:
         errors_deg=by_rank("error_deg", np.inf),
         score=by_rank("score", -np.inf),
         positions=np.stack([by_rank(f"t_{c}", np.nan) for c in "xyz"], axis=2),
-        truth=np.stack([_by_query(table, f"true_{c}", at, count) for c in "xyz"], axis=1),
+        truth=np.stack([_by_query(table, f"true_{c}", owner, count) for c in "xyz"], axis=1),
         trial=trial,
-        passage=_by_query(table, "passage", at, count).astype(np.int64),
-        cpu_s=_by_query(table, "cpu_s", at, count),
+        passage=_by_query(table, "passage", owner, count).astype(np.int64),
+        cpu_s=_by_query(table, "cpu_s", owner, count),
         fit=fit or Spent(),
     )
 
 
-def _by_query(table: pa.Table, column: str, at: NDArray[np.int64], count: int) -> F64:
+def _by_query(table: pa.Table, column: str, owner: NDArray[np.int64], count: int) -> F64:
     out = np.zeros(count)
-    out[at] = table[column].to_numpy()
+    out[owner] = table[column].to_numpy()
     return out

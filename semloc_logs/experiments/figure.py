@@ -115,16 +115,16 @@ def _counted(scenario: Scenario) -> str:
 
 
 def _errors(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str) -> None:
-    at = np.linspace(0.0, _MOST_ERROR_M, 101)
+    thresholds = np.linspace(0.0, _MOST_ERROR_M, 101)
     for number, answers in _lines(rows, sensor, scenario):
-        panel.plot(at, error_curve(answers.first_m, at), **_style(number))
+        panel.plot(thresholds, error_curve(answers.first_m, thresholds), **_style(number))
     _frame(panel, (0.0, _MOST_ERROR_M), "error (m)")
 
 
 def _ranks(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str, threshold: float) -> None:
-    at = np.arange(1, MOST_POSES + 1)
+    ranks = np.arange(1, MOST_POSES + 1)
     for number, answers in _lines(rows, sensor, scenario):
-        panel.plot(at, rank_recall(answers.errors_m, threshold), **_style(number))
+        panel.plot(ranks, rank_recall(answers.errors_m, threshold), **_style(number))
     panel.set_xscale("log")
     _frame(panel, (1.0, float(MOST_POSES)), "rank")
     panel.set_xticks([1, 10, 100], ["1", "10", "100"])

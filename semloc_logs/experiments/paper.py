@@ -230,14 +230,14 @@ def run_systems(
             request.note(f"{task.entry.title}, {sensor}: {reason}")
         for sensor in stores:
             for scenario in scenarios[sensor]:
-                found = read_answers(task.run(sensor), scenario, request.folder / ANSWERS)
-                if len(found):
-                    row.answers[sensor, scenario.name] = found
+                answers = read_answers(task.run(sensor), scenario, request.folder / ANSWERS)
+                if len(answers):
+                    row.answers[sensor, scenario.name] = answers
         rows.append(row)
     known = {
-        (row.name, sensor, scenario): found
+        (row.name, sensor, scenario): answers
         for row in rows
-        for (sensor, scenario), found in row.answers.items()
+        for (sensor, scenario), answers in row.answers.items()
     }
     rivals = [entry.name for entry in BASELINES]
     outcome = Outcome(rows, scenarios, stores, findings(known, rivals), request.quick)

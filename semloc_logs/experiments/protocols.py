@@ -124,14 +124,14 @@ def pair_figures(retrievals: Sequence[Retrieval], seed: int = 0) -> PairFigures:
         np.maximum.at(score, (rows, answers.frame[rows, ranks]), answers.score[rows, ranks])
         positive.append(score[away < PAIR_POSITIVE_M])
         negative.append(score[away > PAIR_NEGATIVE_M])
-    near = np.concatenate(positive)
+    positive_rows = np.concatenate(positive)
     far = np.concatenate(negative)
-    most = min(len(far), NEGATIVES * len(near))
+    most = min(len(far), NEGATIVES * len(positive_rows))
     rng = np.random.default_rng([seed, 92])
     far = far[np.sort(rng.choice(len(far), most, replace=False))]
-    right = np.arange(len(near) + len(far)) < len(near)
-    curve = precision_recall(np.concatenate([near, far]), right, len(near))
-    return PairFigures(len(near), len(far), curve.best_f1, curve.extended_precision)
+    right = np.arange(len(positive_rows) + len(far)) < len(positive_rows)
+    curve = precision_recall(np.concatenate([positive_rows, far]), right, len(positive_rows))
+    return PairFigures(len(positive_rows), len(far), curve.best_f1, curve.extended_precision)
 
 
 class RegistrationFigures(NamedTuple):

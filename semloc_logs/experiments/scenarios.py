@@ -141,10 +141,10 @@ def find_passages(store: ViewStore, session: str, allowed: _Allowed) -> list[I64
         matching = allowed.matching(int(view))
         if len(matching):
             away[k] = np.linalg.norm(place[matching] - place[view], axis=1).min()
-    near = np.flatnonzero(away <= NEAR_M)
-    if not len(near):
+    passing = np.flatnonzero(away <= NEAR_M)
+    if not len(passing):
         return []
-    runs = np.split(near, np.flatnonzero(np.diff(near) > _GAP) + 1)
+    runs = np.split(passing, np.flatnonzero(np.diff(passing) > _GAP) + 1)
     return [views[part] for run in runs for part in _parts(run, away, place[views])]
 
 
@@ -259,11 +259,13 @@ def time_scenario(
         return Scenario(name, ())
     place = store.world_T_base[:, :3, 3]
     away, _ = cKDTree(place[numbers]).query(place[views])
-    near = views[away <= NEAR_M]
+    passing = views[away <= NEAR_M]
     planned = tuple(
         PlannedQuery(query_name(store, int(view)), int(view), int(position) // PER_PASSAGE)
         for position, view in zip(
-            _evenly(np.arange(len(near)), extent.most), _evenly(near, extent.most), strict=True
+            _evenly(np.arange(len(passing)), extent.most),
+            _evenly(passing, extent.most),
+            strict=True,
         )
     )
     return Scenario(name, (Trial("000", numbers, planned),) if planned else ())

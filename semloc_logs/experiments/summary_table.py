@@ -141,7 +141,7 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
         }
     out["localised within"] = dict(
         zip(
-            (f"{at:g} m" for at in ERRORS_M.tolist()),
+            (f"{error:g} m" for error in ERRORS_M.tolist()),
             map(_number, error_curve(answers.first_m, ERRORS_M).tolist()),
             strict=True,
         )

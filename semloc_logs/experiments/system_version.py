@@ -23,22 +23,22 @@ def _files_of(module: str) -> set[Path]:
     """The files that a module consists of, directly and by its imports; data files of a package
     such as weights count with its modules.
     """
-    found: set[Path] = set()
+    sources: set[Path] = set()
     left = [module]
     while left:
         path = _path(left.pop())
-        if path is None or path in found:
+        if path is None or path in sources:
             continue
-        found.add(path)
+        sources.add(path)
         left += _imports(path)
-    folders = {path.parent for path in found} - {_ROOT}
+    folders = {path.parent for path in sources} - {_ROOT}
     data = {
         file
         for folder in folders
         for file in folder.glob("*/*")
         if file.suffix in SUFFIXES and file.suffix != ".py"
     }
-    return found | data
+    return sources | data
 
 
 @cache

@@ -132,8 +132,8 @@ class _Collector:
     def take(self, frame: ImageFrame) -> None:
         """A picture of the log."""
         stamps = self.keyframes.stamps_ns
-        at = int(np.searchsorted(stamps, frame.header.stamp_ns))
-        for number in range(max(0, at - 1), min(len(stamps), at + 1)):
+        row = int(np.searchsorted(stamps, frame.header.stamp_ns))
+        for number in range(max(0, row - 1), min(len(stamps), row + 1)):
             apart = abs(int(stamps[number]) - frame.header.stamp_ns)
             best = self._waiting.get(number)
             if apart <= MOST_APART_NS and (best is None or apart < best.apart_ns):

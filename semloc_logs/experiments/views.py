@@ -181,9 +181,9 @@ def read_views(
     chosen = set(sessions)
     maps = {f.name: SessionMap(f) for f in work.sessions() if not chosen or f.name in chosen}
     tracks = read_truth(truth, maps)
-    found = []
+    views = []
     for name, track in tracks.items():
         poses, known = track.at(maps[name].stamps_ns)
         folder = None if pictures is None else PictureFolder.opened(pictures / name)
-        found.append(SessionViews(maps[name], poses, known, folder))
-    return ViewStore(sorted(found, key=lambda s: s.session.folder.name))
+        views.append(SessionViews(maps[name], poses, known, folder))
+    return ViewStore(sorted(views, key=lambda s: s.session.folder.name))

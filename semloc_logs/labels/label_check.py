@@ -99,12 +99,12 @@ class LabelCheck:
                     f"ground and above it alike"
                 )
         for label in GROUND:
-            far, near = self._of_class[label].tolist()
-            is_much = far + near >= max(_FEWEST, 0.02 * total)
-            if is_much and near < LEAST_ON_ITS_GROUND * (far + near):
+            far, near_ground = self._of_class[label].tolist()
+            is_much = far + near_ground >= max(_FEWEST, 0.02 * total)
+            if is_much and near_ground < LEAST_ON_ITS_GROUND * (far + near_ground):
                 return (
-                    f"as classes they do not fit the geometry: {far / (far + near):.0%} of the "
-                    f"points of a ground class lie away from the ground"
+                    f"as classes they do not fit the geometry: {far / (far + near_ground):.0%} of "
+                    f"the points of a ground class lie away from the ground"
                 )
         return ""
 

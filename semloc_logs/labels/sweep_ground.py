@@ -216,12 +216,12 @@ def _relax(z: F64, gap: F64, nx: int, ny: int, scale: float) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def _bilinear(z: F64, at: F64) -> F64:
-    """Values at fractional indices ``at`` (n, 2), clamped to the grid."""
-    out = np.empty(len(at))
-    for k in range(len(at)):
-        u = min(max(at[k, 0], 0.0), z.shape[0] - 1.0)
-        v = min(max(at[k, 1], 0.0), z.shape[1] - 1.0)
+def _bilinear(z: F64, position: F64) -> F64:
+    """Values at fractional indices ``position`` (n, 2), clamped to the grid."""
+    out = np.empty(len(position))
+    for k in range(len(position)):
+        u = min(max(position[k, 0], 0.0), z.shape[0] - 1.0)
+        v = min(max(position[k, 1], 0.0), z.shape[1] - 1.0)
         i = min(int(u), z.shape[0] - 2)
         j = min(int(v), z.shape[1] - 2)
         a = u - i

@@ -149,8 +149,8 @@ class RemotePath(PosixPath):
 
     def iterdir(self) -> Generator[RemotePath, None, None]:
         """The files and folders in it."""
-        found = _requested(self, lambda system: system.ls(self._listed(), detail=False))
-        for name in sorted({str(f).rstrip("/").rpartition("/")[2] for f in found}):
+        names = _requested(self, lambda system: system.ls(self._listed(), detail=False))
+        for name in sorted({str(f).rstrip("/").rpartition("/")[2] for f in names}):
             if name != self.name:
                 yield self / name
 
@@ -159,8 +159,8 @@ class RemotePath(PosixPath):
 
     def matches(self) -> list[RemotePath]:
         """The files that the address as a pattern matches, sorted."""
-        found = _requested(self, lambda system: system.glob(self._address()))
-        return [RemotePath.of_url(f"{self.scheme}://{name}") for name in sorted(found)]
+        paths = _requested(self, lambda system: system.glob(self._address()))
+        return [RemotePath.of_url(f"{self.scheme}://{name}") for name in sorted(paths)]
 
     def info(self) -> dict[str, Any]:
         """Facts about it: ``size``, ``type`` and more. FileNotFoundError where it is missing."""
@@ -266,8 +266,8 @@ class RemoteFile(_Positioned, io.RawIOBase):
         stop = min(until * BLOCK, self._size)
         data = self._path.read_range(first * BLOCK, stop)
         for k in range(first, -(-stop // BLOCK)):
-            at = (k - first) * BLOCK
-            self._blocks[k] = data[at : at + BLOCK]
+            begin = (k - first) * BLOCK
+            self._blocks[k] = data[begin : begin + BLOCK]
             self._blocks.move_to_end(k)
         while len(self._blocks) > _KEPT:
             self._blocks.popitem(last=False)
@@ -328,10 +328,10 @@ class _Upload(_Positioned, io.BufferedIOBase):
 
     def write(self, data: Any) -> int:
         content = memoryview(data).cast("B")
-        at = self._position - self._sent
-        if not 0 <= at <= len(self._held):
+        begin = self._position - self._sent
+        if not 0 <= begin <= len(self._held):
             raise OSError(errno.ESPIPE, "an earlier part was sent already", str(self._path))
-        self._held[at : at + len(content)] = content
+        self._held[begin : begin + len(content)] = content
         self._position += len(content)
         if len(self._held) > _HELD + _PART:
             self._send(len(self._held) - _HELD)
@@ -339,13 +339,13 @@ class _Upload(_Positioned, io.BufferedIOBase):
 
     def read(self, size: int | None = -1) -> bytes:
         size = -1 if size is None else size
-        at = self._position - self._sent
-        if at < 0:
+        begin = self._position - self._sent
+        if begin < 0:
             if size < 0 or self._position + size > len(self._head):
                 raise OSError(errno.ESPIPE, "an earlier part was sent already", str(self._path))
             data = self._head[self._position : self._position + size]
         else:
-            data = bytes(self._held[at : len(self._held) if size < 0 else at + size])
+            data = bytes(self._held[begin : len(self._held) if size < 0 else begin + size])
         self._position += len(data)
         return data
 

@@ -134,7 +134,7 @@ def read_choice(streams: Sequence[Stream], overrides: Mapping[str, str]) -> Choi
             raise TopicError(
                 f"{flag}: the role '{role}' is unknown; the roles are {', '.join(ROLES)}."
             )
-        found = []
+        role_topics = []
         for wanted in _parts(value):
             topic, rest = _split(streams, wanted, flag)
             candidates = _that_can(role, streams, topic, flag)
@@ -146,10 +146,10 @@ def read_choice(streams: Sequence[Stream], overrides: Mapping[str, str]) -> Choi
             chosen.setdefault(topic, best_stream(narrowed or candidates))
             if len(narrowed) == 1:
                 decided.add(topic)
-            found.append(topic)
-        if role in SINGLE and len(found) > 1:
-            raise TopicError(f"{flag}: the role '{role}' takes one topic, not {len(found)}.")
-        topics[role] = tuple(dict.fromkeys(found))
+            role_topics.append(topic)
+        if role in SINGLE and len(role_topics) > 1:
+            raise TopicError(f"{flag}: the role '{role}' takes one topic, not {len(role_topics)}.")
+        topics[role] = tuple(dict.fromkeys(role_topics))
     return Choice(topics, chosen, frozenset(decided), pose_frame)
 
 

@@ -125,16 +125,16 @@ class UpEvidence:
         some = self._rng.choice(len(n), count, replace=False, p=self._weights)
         candidates = np.concatenate([n[some], -n[some]])
         order = np.argsort(-self._quick_scores(candidates), kind="stable")
-        found = [up, -up]
+        directions = [up, -up]
         for c in candidates[order]:
-            if any(float(c @ other) > np.cos(APART) for other in found):
+            if any(float(c @ other) > np.cos(APART) for other in directions):
                 continue
             direction = refined(n, self._weights, c, c)
             if float(direction @ up) < np.cos(APART):
-                found.append(direction)
-            if len(found) > OTHERS:
+                directions.append(direction)
+            if len(directions) > OTHERS:
                 break
-        return np.array(found[1:])
+        return np.array(directions[1:])
 
     def _quick_scores(self, directions: F64) -> F64:
         """Of ``directions`` (k, 3), without what lies below the ground."""

@@ -75,7 +75,7 @@ def draw_grid(axes: Axes, low: tuple[float, float], metres: float) -> None:
     for axis, extent in enumerate((width, height)):
         first = np.ceil(low[axis] / step) * step
         for value in np.arange(first, low[axis] + extent * metres, step):
-            at = (value - low[axis]) / metres
+            position = (value - low[axis]) / metres
             text = f"{value / 1000:g} km" if step >= 1000 else f"{value + 0.0:.9g} m"
             shared: dict[str, Any] = {
                 "textcoords": "offset points",
@@ -85,11 +85,11 @@ def draw_grid(axes: Axes, low: tuple[float, float], metres: float) -> None:
             }
             style: dict[str, Any] = {"color": web_colour(GRID), "linewidth": 0.6, "zorder": 0.5}
             if axis == 0:
-                axes.axvline(at, **style)
-                axes.annotate(text, (at, height), (3, 3), **shared)
+                axes.axvline(position, **style)
+                axes.annotate(text, (position, height), (3, 3), **shared)
             else:
-                axes.axhline(height - at, **style)
-                axes.annotate(text, (0, height - at), (3, 3), **shared)
+                axes.axhline(height - position, **style)
+                axes.annotate(text, (0, height - position), (3, 3), **shared)
 
 
 def draw_line(axes: Axes, line: F64, colour: Colour, width: float = 2.0) -> None:

@@ -79,9 +79,9 @@ class View:
         )
 
 
-def top_view(at: tuple[float, float, float], width: int, height: int, metres: float) -> View:
+def top_view(point: tuple[float, float, float], width: int, height: int, metres: float) -> View:
     """From above, x to the right and y up."""
-    return View(-np.pi / 2, np.pi / 2, at, width, height, metres)
+    return View(-np.pi / 2, np.pi / 2, point, width, height, metres)
 
 
 def draw_solids(solids: Sequence[Solid], view: View) -> U8:

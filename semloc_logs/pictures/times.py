@@ -14,8 +14,8 @@ def time_text(stamp_ns: int) -> str:
     if stamp_ns < DATED_NS:
         return f"{stamp_ns / 1e9:.1f} s"
     tenths = (stamp_ns + TENTH_NS // 2) // TENTH_NS
-    at = EPOCH + timedelta(seconds=tenths // 10)
-    return f"{at:%Y-%m-%d %H:%M:%S}.{tenths % 10}"
+    moment = EPOCH + timedelta(seconds=tenths // 10)
+    return f"{moment:%Y-%m-%d %H:%M:%S}.{tenths % 10}"
 
 
 def period_text(first_ns: int, last_ns: int) -> str:

@@ -88,8 +88,8 @@ def write_merged_map(
             voxels = _Tile(tile, seen, len(posed))
             for k, own in enumerate(submaps):
                 if len(voxels.keys):
-                    near = [s for s, b in zip(own, bounds[k], strict=True) if voxels.meets(s, b)]
-                    voxels.observe(k, near)
+                    meeting = [s for s, b in zip(own, bounds[k], strict=True) if voxels.meets(s, b)]
+                    voxels.observe(k, meeting)
             table = voxels.merged(names)
             changes.append(voxels.changed(names))
             total += table.num_rows
@@ -173,7 +173,7 @@ class _Tile:
 
     def observe(self, session: int, submaps: Sequence[PlacedSubmap]) -> None:
         """Add what the next recorded session saw."""
-        occupied, near = self._occupied_by(session)
+        occupied, is_near = self._occupied_by(session)
         free, stamps_ns = self._free_by(submaps, ~occupied)
         if session in self._seen:
             seen = self._seen[session]
@@ -187,7 +187,7 @@ class _Tile:
         self._is_occupied[occupied] = True
         self._is_occupied[free] = False
         # gone: the first free one after it was seen; appeared: the last free one before
-        counts = free & ~near
+        counts = free & ~is_near
         before = self._last[0] == NONE
         later = ~before & (self._free[0] < self._last[0])
         chosen = counts & (before | later)
@@ -199,10 +199,10 @@ class _Tile:
         if session not in self._seen:
             return np.zeros(len(self.keys), bool), np.zeros(len(self.keys), bool)
         keys = self._seen[session].keys
-        near = np.zeros(len(self.keys), bool)
+        is_near = np.zeros(len(self.keys), bool)
         for step in NEIGHBOURS:
-            near |= np.isin(pack(self._ijk + step), keys)
-        return np.isin(self.keys, keys), near
+            is_near |= np.isin(pack(self._ijk + step), keys)
+        return np.isin(self.keys, keys), is_near
 
     def _free_by(self, submaps: Sequence[PlacedSubmap], wanted: Mask) -> tuple[Mask, I64]:
         """Which of the ``wanted`` voxels submaps saw free, and none occupied; with stamps."""

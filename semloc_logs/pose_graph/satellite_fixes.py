@@ -48,9 +48,9 @@ def positions_of(
     """
     table = read_table(session.folder.trajectory)
     stamps_ns = np.asarray(fixes["stamp_ns"].to_numpy())
-    near, map_T_base = _poses_at(session, table, stamps_ns)
-    fixes = fixes.filter(pa.array(near))
-    stamps_ns = stamps_ns[near]
+    is_known, map_T_base = _poses_at(session, table, stamps_ns)
+    fixes = fixes.filter(pa.array(is_known))
+    stamps_ns = stamps_ns[is_known]
     keyframe, rows = _of_keyframes(session.stamps_ns, stamps_ns)
     chosen = fixes.take(rows)
 
@@ -96,9 +96,9 @@ def _poses_at(
         return np.zeros(len(stamps_ns), bool), np.zeros((0, 4, 4))
     after = np.clip(np.searchsorted(known_ns, stamps_ns), 1, len(known_ns) - 1)
     is_between = (stamps_ns >= known_ns[0]) & (stamps_ns <= known_ns[-1])
-    near = is_between & (known_ns[after] - known_ns[after - 1] <= MOST_GAP_NS)
-    seconds = (stamps_ns[near] - known_ns[0]) * 1e-9
+    is_known = is_between & (known_ns[after] - known_ns[after - 1] <= MOST_GAP_NS)
+    seconds = (stamps_ns[is_known] - known_ns[0]) * 1e-9
     known_s = (known_ns - known_ns[0]) * 1e-9
     turns = Slerp(known_s, Rotation.from_matrix(known[:, :3, :3]))(seconds)
     places = np.stack([np.interp(seconds, known_s, known[:, axis, 3]) for axis in range(3)], 1)
-    return near, transform(places, turns.as_quat().reshape(-1, 4))
+    return is_known, transform(places, turns.as_quat().reshape(-1, 4))

@@ -122,14 +122,14 @@ def _keys() -> list[str]:
 
 def choices() -> dict[str, tuple[str, ...]]:
     """The key of every setting, with its values where it has a few fixed ones."""
-    found: dict[str, tuple[str, ...]] = {}
+    by_key: dict[str, tuple[str, ...]] = {}
     for section, values in Settings():
         for name, field in type(values).model_fields.items():
             kinds = (field.annotation, *get_args(field.annotation))
             fixed = [v for kind in kinds if get_origin(kind) is Literal for v in get_args(kind)]
             of_switch = ("true", "false") if bool in kinds else ()
-            found[f"{section}.{name}"] = tuple(map(str, fixed)) or of_switch
-    return found
+            by_key[f"{section}.{name}"] = tuple(map(str, fixed)) or of_switch
+    return by_key
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:

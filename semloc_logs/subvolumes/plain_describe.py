@@ -94,8 +94,8 @@ def describe_windows(state: U8, corners: I64, encoder: PlainEncoder) -> F32:
     for shift in np.unique(odd, axis=0):
         rows = np.flatnonzero((odd == shift).all(1))
         x, y, z = shift.tolist()
-        found = encoder.of_windows(codes[x:, y:, z:], corners[rows] - shift, BATCH)
-        out[rows] = torch.cat([*found]).numpy()
+        descriptors = encoder.of_windows(codes[x:, y:, z:], corners[rows] - shift, BATCH)
+        out[rows] = torch.cat([*descriptors]).numpy()
     return out
 
 

@@ -104,9 +104,9 @@ def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None
 
 
 @njit(cache=True, nogil=True)
-def _none(found: U8, first: int) -> bool:
+def _none(seen: U8, first: int) -> bool:
     """Whether four bytes are zero."""
-    return not (found[first] | found[first + 1] | found[first + 2] | found[first + 3])
+    return not (seen[first] | seen[first + 1] | seen[first + 2] | seen[first + 3])
 
 
 @njit(cache=True, nogil=True)
@@ -139,9 +139,9 @@ def _pooled(cell: U8, rows: F32, of_uniform: F32, total: F32, best: F32, which: 
     free = rows.shape[2] - 4
     count_free = 0
     count_unobserved = 0
-    for at in range(64):
-        count_free += cell[at] == free
-        count_unobserved += cell[at] == free + 1
+    for child in range(64):
+        count_free += cell[child] == free
+        count_unobserved += cell[child] == free + 1
     u = int(count_unobserved > count_free)
     if max(count_free, count_unobserved) == 64:
         for c in range(FIRST):
@@ -151,9 +151,9 @@ def _pooled(cell: U8, rows: F32, of_uniform: F32, total: F32, best: F32, which: 
     for voxel in range(8):
         for c in range(FIRST):
             total[voxel * FIRST + c] = of_uniform[u, c]
-    for at in range(64):
-        if cell[at] != free + u:
-            row = rows[u, at, cell[at]]
+    for child in range(64):
+        if cell[child] != free + u:
+            row = rows[u, child, cell[child]]
             for n in range(8 * FIRST):
                 total[n] += row[n]
     for c in range(FIRST):
@@ -206,8 +206,8 @@ def window_blocks(box: BoxArrays, corners: NDArray[np.int64], filters: Filters, 
 
 
 @njit(cache=True, nogil=True)
-def _inside(codes: U8, at: Place, within: Place, cell: U8, margin: int) -> None:
-    """The codes about the cell ``at`` of a box in ``cell``, 4 x 4 x 4 of them, those beyond the
+def _inside(codes: U8, corner: Place, within: Place, cell: U8, margin: int) -> None:
+    """The codes about the cell ``corner`` of a box in ``cell``, 4 x 4 x 4 of them, those beyond the
     faces of the window in which it is the cell ``within`` as ``margin``.
     """
     for a in range(4):
@@ -218,7 +218,7 @@ def _inside(codes: U8, at: Place, within: Place, cell: U8, margin: int) -> None:
                 z = 2 * within[2] + c - 1
                 code = margin
                 if 0 <= x < SIZE and 0 <= y < SIZE and 0 <= z < SIZE:
-                    code = codes[2 * at[0] + a, 2 * at[1] + b, 2 * at[2] + c]
+                    code = codes[2 * corner[0] + a, 2 * corner[1] + b, 2 * corner[2] + c]
                 cell[(a * 4 + b) * 4 + c] = code
 
 

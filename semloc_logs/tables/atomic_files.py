@@ -53,8 +53,8 @@ def stale_temporaries(path: Path) -> list[Path]:
 
     Those of a process that is alive are not.
     """
-    found = sorted(path.parent.glob(f".{glob.escape(path.name)}.*.tmp"))
-    return [p for p in found if not _is_in_use(p.name.removeprefix(f".{path.name}."))]
+    temporaries = sorted(path.parent.glob(f".{glob.escape(path.name)}.*.tmp"))
+    return [p for p in temporaries if not _is_in_use(p.name.removeprefix(f".{path.name}."))]
 
 
 def is_alive(process: int) -> bool:

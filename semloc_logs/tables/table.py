@@ -55,10 +55,10 @@ def write_table(
             row_group_size=row_group,
             sorting_columns=columns or None,
         )
-        found = pq.read_metadata(temporary).num_rows
-        if found != table.num_rows:
+        rows = pq.read_metadata(temporary).num_rows
+        if rows != table.num_rows:
             raise ContractError(
-                f"{path}: {found} rows were written of {table.num_rows}; is the disk full?"
+                f"{path}: {rows} rows were written of {table.num_rows}; is the disk full?"
             )
 
 
@@ -76,8 +76,8 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
 def read_metadata(path: Path) -> dict[str, Any]:
     """The JSON ``semloc`` key of a table's metadata."""
     try:
-        found = pq.read_schema(path).metadata or {}
-        content: dict[str, Any] = json.loads(found[b"semloc"])
+        metadata = pq.read_schema(path).metadata or {}
+        content: dict[str, Any] = json.loads(metadata[b"semloc"])
     except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
         raise WorkspaceError(
             f"{path} has no semloc metadata ({problem}): "

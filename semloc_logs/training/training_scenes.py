@@ -217,8 +217,8 @@ def _street(
                 back, begin + spacing * np.arange(count, dtype=np.float64), ground.slope_height, rng
             )
         beside = line + rng.normal() * 0.7
-        at = start + rng.uniform(0, 20) + spacing * np.arange(count, dtype=np.float64)
-        return poses_along(beside, at, ground.slope_height, rng)
+        times = start + rng.uniform(0, 20) + spacing * np.arange(count, dtype=np.float64)
+        return poses_along(beside, times, ground.slope_height, rng)
 
     def drive(poses: F64, condition: Condition) -> _Drive:
         seconds = np.arange(len(poses), dtype=np.float64) * spacing / speed

@@ -258,13 +258,13 @@ def _look(
     count: I64,
     limit: int,
     distance: U8,
-    at: I64,
+    positions: I64,
 ) -> tuple[int, int]:
     """Entries of a segment that query ``q`` with codes (p,) may want.
 
-    Their distances, and positions and probes in ``at`` (2, m). ``count`` (66,) entries were found
-    at each distance up to ``limit``. Returns how many are found now and the new limit, within which
-    there are ``size``; the entries of this segment within it have been added to ``count``.
+    Their distances, and positions and probes in ``positions`` (2, m). ``count`` (66,) entries were
+    found at each distance up to ``limit``. Returns how many match now and the new limit, within
+    which there are ``size``; the entries of this segment within it have been added to ``count``.
     """
     offsets, firsts, lasts, probes = ranges
     n = 0
@@ -284,7 +284,7 @@ def _look(
     bound = _bound(histogram, int(histogram[: limit + 1].sum()), limit, size)
     step = 1
     while True:
-        found = 0
+        matches = 0
         n = 0
         new = count.copy()
         for r in range(offsets[q], offsets[q + 1]):
@@ -293,9 +293,9 @@ def _look(
             into = distance[n : n + end - first]
             for i in range(len(into)):
                 if into[i] <= bound and _may_answer(lists, first + i):
-                    at[0, found], at[1, found] = first + i, probes[r]
+                    positions[0, matches], positions[1, matches] = first + i, probes[r]
                     new[into[i]] += 1
-                    found += 1
+                    matches += 1
             n += end - first
         within = int(new[: bound + 1].sum())
         if within >= size or bound == limit:
@@ -304,7 +304,7 @@ def _look(
         bound = min(bound + step, limit)
         step = 2 * step
     count[:] = new
-    return found, _bound(new, within, bound, size)
+    return matches, _bound(new, within, bound, size)
 
 
 @njit(cache=True, nogil=True)
@@ -322,18 +322,20 @@ def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limi
             entries += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
         most = max(most, entries)
     distance = np.empty(most, np.uint8)
-    at = np.empty((2, most), np.int64)
+    positions = np.empty((2, most), np.int64)
     out = np.empty((3, 64 * len(codes) + most), np.int64)
     total = 0
     for q in range(len(codes)):
-        found, limit[q] = _look(codes[q], ranges, q, lists, size, count[q], limit[q], distance, at)
-        if total + found > out.shape[1]:
-            more = np.empty((3, 2 * (total + found)), np.int64)
+        matches, limit[q] = _look(
+            codes[q], ranges, q, lists, size, count[q], limit[q], distance, positions
+        )
+        if total + matches > out.shape[1]:
+            more = np.empty((3, 2 * (total + matches)), np.int64)
             more[:, :total] = out[:, :total]
             out = more
-        for i in range(found):
-            if popcount(codes[q, at[1, i]] ^ lists.code[at[0, i]]) <= limit[q]:
-                out[0, total], out[1, total], out[2, total] = q, at[0, i], at[1, i]
+        for i in range(matches):
+            if popcount(codes[q, positions[1, i]] ^ lists.code[positions[0, i]]) <= limit[q]:
+                out[0, total], out[1, total], out[2, total] = q, positions[0, i], positions[1, i]
                 total += 1
     return out[:, :total].copy()
 

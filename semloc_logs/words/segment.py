@@ -126,13 +126,13 @@ def segment_in_memory(sessions: tuple[Held, ...], columns: Columns) -> Segment:
 
 def _layout(header: int, entries: int) -> tuple[dict[str, int], int]:
     """Where each array begins after a header of so many bytes, and the length of the file."""
-    at = PREFIX.size + header
+    position = PREFIX.size + header
     offsets = {}
     for name, kind, columns in (STARTS, *ARRAYS):
-        at = -(-at // ALIGNMENT) * ALIGNMENT
-        offsets[name] = at
-        at += np.dtype(kind).itemsize * columns * (WORDS + 1 if name == "starts" else entries)
-    return offsets, at
+        position = -(-position // ALIGNMENT) * ALIGNMENT
+        offsets[name] = position
+        position += np.dtype(kind).itemsize * columns * (WORDS + 1 if name == "starts" else entries)
+    return offsets, position
 
 
 def write_segment(

@@ -147,8 +147,8 @@ def segments(
             f"Session {lacking[0]} has no words: run 'semloc describe -w {work.path}' first."
         )
     names = [n for n in names if n in words]
-    found, good = _open_all(folder, variant)
-    serving = _serving(found, words)
+    opened, good = _open_all(folder, variant)
+    serving = _serving(opened, words)
     if not good or set(names) - set().union(*serving.values()) or _wasteful(serving):
         with _locked(folder):
             serving = _build(folder, variant, words, names, change)
@@ -207,14 +207,14 @@ def _open_all(folder: Path, variant: str) -> tuple[list[Segment], bool]:
     return [], True
 
 
-def _serving(found: Sequence[Segment], words: Mapping[str, SessionWords]) -> Serving:
+def _serving(opened: Sequence[Segment], words: Mapping[str, SessionWords]) -> Serving:
     """The sessions that each segment serves.
 
     Each session is served by the first segment that holds its present words.
     """
     taken: set[str] = set()
     out: Serving = {}
-    for segment in found:
+    for segment in opened:
         served = {
             h.name for h in segment.sessions if h.name in words and words[h.name].key == h.key
         } - taken

@@ -29,7 +29,7 @@ PAPER = 0.87  # accuracy (4.3)
 SHOWN = 6  # subvolumes in the picture
 
 
-def completion_figures(found: Completed) -> Figures:
+def completion_figures(completions: Completed) -> Figures:
     """Over the voxels that the complete map observed, as classes or free; ``all_free`` and
     ``copy_input`` are the two trivial answers.
 
@@ -40,22 +40,22 @@ def completion_figures(found: Completed) -> Figures:
     where the input observed nothing; ``mean_iou``: mean over the occupied classes that occur;
     ``occupied_iou``, ``free_iou``: of occupied and free whatever the class.
     """
-    known = found.truth <= found.classes
-    truth = found.truth[known]
+    known = completions.truth <= completions.classes
+    truth = completions.truth[known]
     answers = {
-        "ours": found.completed[known],
-        "most_probable": found.probable[known],
-        "all_free": np.full_like(truth, found.classes),
-        "copy_input": found.given[known],
+        "ours": completions.completed[known],
+        "most_probable": completions.probable[known],
+        "all_free": np.full_like(truth, completions.classes),
+        "copy_input": completions.given[known],
     }
-    hidden = answers["copy_input"] == found.classes + 1
+    hidden = answers["copy_input"] == completions.classes + 1
     answers["input_completed"] = np.where(hidden, answers["ours"], answers["copy_input"])
     figures: Figures = {}
     for who, codes in answers.items():
         confusion = np.bincount(truth.astype(np.int64) * 32 + codes, minlength=32 * 32).reshape(
             32, 32
         )
-        scores = _scores(confusion, found.classes)
+        scores = _scores(confusion, completions.classes)
         scores["unobserved_accuracy"] = (
             float((codes == truth)[hidden].mean()) if hidden.any() else 0.0
         )
@@ -116,27 +116,27 @@ def completion_benchmark(
             parts.append(tuple(a[np.sort(rows)] for a in pairs))
             note(f"pairs of {number + 1} of {len(SEEDS)} streets are cut")
     a, b, c = (np.concatenate([p[k] for p in parts]) for k in range(3))
-    found = completed(model, (a, b, c))
+    completions = completed(model, (a, b, c))
     if picture is not None:
-        rows = _worth_seeing(found)
+        rows = _worth_seeing(completions)
         draw_completions(
             picture,
             variant,
             *(
-                states_of(v[rows], found.classes)
-                for v in (found.given, found.completed, found.truth)
+                states_of(v[rows], completions.classes)
+                for v in (completions.given, completions.completed, completions.truth)
             ),
         )
-    return completion_figures(found)
+    return completion_figures(completions)
 
 
-def _worth_seeing(found: Completed) -> I64:
+def _worth_seeing(completions: Completed) -> I64:
     """Rows with much to complete and many classes, far from each other in the list."""
-    occupied = found.truth < found.classes
-    hidden = (occupied & (found.given == found.classes + 1)).sum((1, 2, 3)) / np.maximum(
-        occupied.sum((1, 2, 3)), 1
-    )
-    kinds = np.array([len(np.unique(t[t < found.classes])) for t in found.truth])
+    occupied = completions.truth < completions.classes
+    hidden = (occupied & (completions.given == completions.classes + 1)).sum(
+        (1, 2, 3)
+    ) / np.maximum(occupied.sum((1, 2, 3)), 1)
+    kinds = np.array([len(np.unique(t[t < completions.classes])) for t in completions.truth])
     score = kinds + 5 * hidden + 5 * np.minimum(occupied.mean((1, 2, 3)) / 0.1, 1)
     groups = np.array_split(np.arange(len(score)), min(SHOWN, len(score)))
     return np.array([g[np.argmax(score[g])] for g in groups if len(g)], np.int64)

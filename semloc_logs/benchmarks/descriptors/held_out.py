@@ -198,8 +198,8 @@ class _Drive:
     def length(self) -> float:
         return 0.5 * (len(self.line) - 1)
 
-    def poses(self, at: F64) -> F64:
-        return poses_along(self.line, at, self.height, self.rng)
+    def poses(self, distances: F64) -> F64:
+        return poses_along(self.line, distances, self.height, self.rng)
 
     def camera(self, pose: F64, yaw: float) -> Cloud:
         model = replace(CAMERAS["stereo"], yaw=yaw)
@@ -249,7 +249,7 @@ def simulate_street(town: int, road: int, settings: Resolved, extent: Extent = E
         again = drive(
             SNOW if name == "season" else LATER, float(rng.choice([-1, 1]) * rng.uniform(0.4, 1.2))
         )
-        found = queries.setdefault(name, [])
+        query_frames = queries.setdefault(name, [])
         for frames in FRAMES:
             for _ in range(extent.queries):
                 middle = rng.uniform(0.2, 0.8) * again.length
@@ -260,7 +260,7 @@ def simulate_street(town: int, road: int, settings: Resolved, extent: Extent = E
                 clouds = [
                     again.camera(p, yaw) if sensor == "camera" else again.lidar(p) for p in poses
                 ]
-                found.append(
+                query_frames.append(
                     _query(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi)))
                 )
     return Street(database, queries)
@@ -273,8 +273,14 @@ def _fuse(
     fuser = Fuser(settings.fusion)
     track = []
     for (points, origin, labels, sigma), pose in zip(clouds, poses, strict=True):
-        near = np.linalg.norm(points - origin, axis=1) < radius
-        fuser.add(points[near], labels[near], origin, None if sigma is None else sigma[near], pose)
+        is_inside = np.linalg.norm(points - origin, axis=1) < radius
+        fuser.add(
+            points[is_inside],
+            labels[is_inside],
+            origin,
+            None if sigma is None else sigma[is_inside],
+            pose,
+        )
         track.append(apply(pose, origin[None])[0])
     return fuser.finish(), np.array(track, np.float64)
 

@@ -56,8 +56,8 @@ def fpfh_describes(
         centre = described(place, is_query).centre
         if not len(centre):
             return Described(centre, np.zeros((0, 33), np.float32))
-        found = np.load(folder / f"features_{_key(place, is_query)}.npy")
-        return Described(centre, found.astype(np.float32))
+        features = np.load(folder / f"features_{_key(place, is_query)}.npy")
+        return Described(centre, features.astype(np.float32))
 
     return describe
 

@@ -113,12 +113,12 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
     Scenarios other than the five have a database of their own name, filled up with the LIDAR's.
     """
     v = world.settings.fusion.voxel_size
-    found: dict[str, list[Words]] = {}
+    words_of_kind: dict[str, list[Words]] = {}
     queries: dict[str, list[Words]] = {}
     rng = np.random.default_rng(0)
     for street in world.streets():
         for kind, place in street.database:
-            found.setdefault(kind, []).append(_words(place, describe(place, False), v))
+            words_of_kind.setdefault(kind, []).append(_words(place, describe(place, False), v))
         for name, places in street.queries.items():
             for place in places:
                 words = _words(place, describe(place, True), v)
@@ -128,7 +128,7 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
                 )
     if "0" in queries:  # the queries of the camera that looks ahead, in the LIDAR's map too
         queries["sensor"] = queries["0"]
-    databases = {kind: _joined(parts) for kind, parts in found.items()}
+    databases = {kind: _joined(parts) for kind, parts in words_of_kind.items()}
     radius = true_radius(world.settings)
     out = {}
     for name, parts in queries.items():

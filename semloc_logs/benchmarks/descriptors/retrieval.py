@@ -93,11 +93,11 @@ def retrieval_benchmark(
             )
             columns = {"trained": retrieval_recall(world, load_encoder(variant, choice.weights))}
             note(f"{variant}: trained weights are measured")
-            found = [
+            results = [
                 retrieval_recall(world, random_encoder(variant, seed)) for seed in range(SEEDS)
             ]
             columns["random"] = {
-                name: float(np.mean([f[name] for f in found])) for name in found[0]
+                name: float(np.mean([f[name] for f in results])) for name in results[0]
             }
             note(f"{variant}: random weights are measured")
             if "fpfh" in peers:

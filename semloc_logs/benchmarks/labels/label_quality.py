@@ -48,13 +48,13 @@ def _index() -> U8:
     return table
 
 
-def confusion(truth: U8, found: U8) -> I64:
+def confusion(truth: U8, predicted: U8) -> I64:
     """Counts (5, 5) of train ids (n,): rows ground, construction, vegetation, pole, other; columns
     these four and unlabelled.
     """
     table = _index()
     row = table[truth]
-    column = np.minimum(table[found], 4)
+    column = np.minimum(table[predicted], 4)
     known = row < 5
     return np.bincount(row[known].astype(np.int64) * 5 + column[known], minlength=25).reshape(5, 5)
 
@@ -66,15 +66,15 @@ def intersection_over_union(counts: I64) -> NDArray[np.float64]:
     return np.where(counts.sum(1)[:4] > 0, right / np.maximum(union, 1), np.nan)
 
 
-def _compare_maps(truth: BlockMap, found: BlockMap) -> I64:
+def _compare_maps(truth: BlockMap, fused: BlockMap) -> I64:
     """Confusion of the voxels that are occupied in both maps, which classes decide a little: what
     is ground is carved less.
     """
-    (ours, our_class, *_), (theirs, their_class, *_) = found.occupied(), truth.occupied()
-    _, at, true_at = np.intersect1d(
+    (ours, our_class, *_), (theirs, their_class, *_) = fused.occupied(), truth.occupied()
+    _, own_rows, true_at = np.intersect1d(
         pack(ours), pack(theirs), assume_unique=True, return_indices=True
     )
-    return confusion(their_class[true_at], our_class[at])
+    return confusion(their_class[true_at], our_class[own_rows])
 
 
 def measure_labels(logs: Sequence[Path], settings: Resolved) -> Figures:
@@ -127,12 +127,12 @@ def _measure_session(
         if not taken:
             classify(level, origin, scale)  # compiles
         start = time.process_time()
-        found = classify(level, origin, scale)
+        predicted = classify(level, origin, scale)
         taken.append(1e3 * (time.process_time() - start))
         sizes.append(len(level))
-        near = np.linalg.norm(level - origin, axis=1) <= far
-        points += confusion(frame.label[near], found[near])
-        for fuser, label in zip(maps, (frame.label, found), strict=True):
+        is_inside = np.linalg.norm(level - origin, axis=1) <= far
+        points += confusion(frame.label[is_inside], predicted[is_inside])
+        for fuser, label in zip(maps, (frame.label, predicted), strict=True):
             fuser.add(level, label, origin)
     return _compare_maps(maps[0].finish(), maps[1].finish())
 

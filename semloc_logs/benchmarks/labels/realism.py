@@ -174,11 +174,11 @@ def _voxels(
     blocks = fuser.finish()
     v = fusion.voxel_size
     ijk, state = blocks.occupied()
-    near = np.linalg.norm((ijk[:, :2] + 0.5) * v, axis=1) < _NEAR
-    numbers["occupied voxels within 30 m"] = float(near.sum())
-    histograms["classes of voxels within 30 m"] = _classes(state[near])
+    is_inside = np.linalg.norm((ijk[:, :2] + 0.5) * v, axis=1) < _NEAR
+    numbers["occupied voxels within 30 m"] = float(is_inside.sum())
+    histograms["classes of voxels within 30 m"] = _classes(state[is_inside])
     names = [*cityscapes().names, "unlabelled"]
-    counts = np.bincount(np.minimum(state[near], 19), minlength=20)
+    counts = np.bincount(np.minimum(state[is_inside], 19), minlength=20)
     for k in (*range(10), 13, 19):
         numbers[f"voxels within 30 m: {names[k]}"] = float(counts[k])
     low = np.array([-128, -128, 0], np.int64)

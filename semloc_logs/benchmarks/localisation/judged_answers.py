@@ -128,11 +128,13 @@ class World:
         if condition == UNSEEN:
             return True
         away = self._away(keyframe)
-        near = int(np.argmin(away))
-        ahead = self.true_database[near, :3, 0] @ self.true_query[keyframe, :3, 0]
+        nearest = int(np.argmin(away))
+        ahead = self.true_database[nearest, :3, 0] @ self.true_query[keyframe, :3, 0]
         between = float(np.arccos(np.clip(ahead, -1.0, 1.0)))
         wanted = np.radians(float(condition)) if condition in (CROSSING, OPPOSITE) else 0.0
-        return bool(away[near] <= NEAR_M.get(condition, LANE_M) and abs(between - wanted) < WINDOW)
+        return bool(
+            away[nearest] <= NEAR_M.get(condition, LANE_M) and abs(between - wanted) < WINDOW
+        )
 
     def errors(self, keyframe: int, map_T_base: F64) -> tuple[float, float]:
         """Metres and degrees by which ``map_T_base`` (4, 4), the base at ``keyframe`` in the
@@ -140,13 +142,16 @@ class World:
         """
         if self.drive.condition == UNSEEN:
             return float("inf"), 180.0
-        near = int(
+        nearest = int(
             np.argmin(
                 np.linalg.norm(self.database.map_T_base[:, :3, 3] - map_T_base[:3, 3], axis=1)
             )
         )
-        found = inverse(self.database.map_T_base[near]) @ map_T_base
-        rest = inverse(inverse(self.true_database[near]) @ self.true_query[keyframe]) @ found
+        target_T_query = inverse(self.database.map_T_base[nearest]) @ map_T_base
+        rest = (
+            inverse(inverse(self.true_database[nearest]) @ self.true_query[keyframe])
+            @ target_T_query
+        )
         return float(np.linalg.norm(rest[:3, 3])), float(np.degrees(rotation_angle(rest[:3, :3])))
 
 

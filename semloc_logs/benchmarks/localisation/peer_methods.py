@@ -84,8 +84,8 @@ class PeerTask:
         write_clouds(folder, world.query, self.keyframes, self.system.length, self.settings)
         candidates, seconds = self._candidates(world, folder, centres)
         queries = [
-            {"cloud": _cloud_name(world.query, k), "candidates": found}
-            for k, found in zip(self.keyframes, candidates, strict=True)
+            {"cloud": _cloud_name(world.query, k), "candidates": rows}
+            for k, rows in zip(self.keyframes, candidates, strict=True)
         ]
         job = {
             "folder": str(folder.absolute()),
@@ -99,10 +99,10 @@ class PeerTask:
         path.write_text(json.dumps(job))
         output = run_peer(self.system.runner, self.python, [str(path)], SECONDS)
         try:
-            found = json.loads(output.splitlines()[-1])["queries"]
+            rows = json.loads(output.splitlines()[-1])["queries"]
             return [
                 self._answer(world, centres, k, f, s)
-                for k, f, s in zip(self.keyframes, found, seconds, strict=True)
+                for k, f, s in zip(self.keyframes, rows, seconds, strict=True)
             ]
         except (ValueError, KeyError, IndexError, TypeError) as problem:
             raise SemlocError(
@@ -121,14 +121,14 @@ class PeerTask:
         if self.system.told:
             order = [
                 [
-                    centres.index(min(centres, key=lambda c: abs(c - near)))
-                    for near in self._near(world, k)
+                    centres.index(min(centres, key=lambda c: abs(c - place)))
+                    for place in self._near(world, k)
                 ]
                 for k in self.keyframes
             ]
-            return [[(k, 0.0) for k in dict.fromkeys(found)][:TOLD] for found in order], [
-                0.0
-            ] * len(self.keyframes)
+            return [[(k, 0.0) for k in dict.fromkeys(row)][:TOLD] for row in order], [0.0] * len(
+                self.keyframes
+            )
         database = [scan_context(_load(folder, world.database, k)) for k in centres]
         nearest_contexts(database[0], database, CANDIDATES)
         out = []

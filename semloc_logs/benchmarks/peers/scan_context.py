@@ -58,6 +58,6 @@ def nearest_contexts(query: F64, database: list[F64], most: int) -> list[tuple[i
     """The ``most`` contexts of the database nearest to the query's, nearest first: their numbers
     and yaws (rad) of database_T_query.
     """
-    found = [context_distance(query, context) for context in database]
-    order = np.argsort([distance for distance, _ in found], kind="stable")[:most]
-    return [(int(k), found[k][1]) for k in order]
+    distances = [context_distance(query, context) for context in database]
+    order = np.argsort([distance for distance, _ in distances], kind="stable")[:most]
+    return [(int(k), distances[k][1]) for k in order]

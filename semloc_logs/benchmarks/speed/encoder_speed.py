@@ -228,8 +228,8 @@ def _begin(variant: str, weights: dict[str, NDArray[Any]], codes: NDArray[np.uin
 
 def _run(times: int) -> NDArray[np.float32]:
     for _ in range(times):
-        found = encode(*_work)
-    return found
+        encoded = encode(*_work)
+    return encoded
 
 
 def _product() -> Callable[[], Any]:

@@ -158,10 +158,10 @@ class _World:
         """Share of the words that ask whose place is among their five nearest."""
         s = self.streets
         m = index.search(s.query, 5, probes, Allowed(np.ones(len(self.names), bool)))
-        near = (m.group == 0) & (
+        is_right = (m.group == 0) & (
             np.linalg.norm(m.centre - s.query_centre[m.query], axis=1) < s.radius
         )
-        return len(np.unique(m.query[near])) / len(s.query)
+        return len(np.unique(m.query[is_right])) / len(s.query)
 
 
 def scaling_benchmark(
@@ -196,13 +196,13 @@ def described(world: HeldOut, describe: Describe) -> Streets:
         ]
         for place, is_query in places:
             words = describe(place, is_query)
-            at = apply(
+            points = apply(
                 place.common_T_map,
                 words.centre.astype(np.float64) * world.settings.fusion.voxel_size,
             )
-            parts["query_centre" if is_query else "centre"].append(at)
+            parts["query_centre" if is_query else "centre"].append(points)
             parts["query" if is_query else "descriptor"].append(words.descriptor)
-            parts["street"].append(np.full(0 if is_query else len(at), number))
+            parts["street"].append(np.full(0 if is_query else len(points), number))
     joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     return Streets(radius=true_radius(world.settings), **joined)
 

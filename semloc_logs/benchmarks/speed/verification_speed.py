@@ -103,11 +103,11 @@ def scene(settings: Resolved, density: float = 25.0, hypotheses: int = 96) -> Sc
             for _ in range(hypotheses - 1)
         ),
     ]
-    found = [
+    tried = [
         Hypothesis(0, (float(p[0]), float(p[1]), float(p[2]), float(p[3])), 1, 1.0) for p in poses
     ]
     return Scene(
-        Target(fused(there, label), v), there, Query(fused(again, label_again), again, v), found
+        Target(fused(there, label), v), there, Query(fused(again, label_again), again, v), tried
     )
 
 

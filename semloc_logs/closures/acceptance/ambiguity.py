@@ -158,7 +158,7 @@ def _contradictions(placed: Placed, pairs: Pairs, support: F64, voxel_size: floa
     targets: dict[str, list[str]] = {}
     for query, target in sure:
         targets.setdefault(query, []).append(target)
-    found = [np.zeros((0, 3), np.int64)]
+    triplets = [np.zeros((0, 3), np.int64)]
     for (a, g), x in sure.items():
         for h in targets[a]:
             if h == g or (g, h) not in sure:
@@ -178,8 +178,8 @@ def _contradictions(placed: Placed, pairs: Pairs, support: F64, voxel_size: floa
             wrong = (distance > APART * scale + (ODOMETRY_DRIFT + ARM) * way) & (
                 np.maximum(*along) <= FAR * scale
             )
-            found.append(np.stack([x, y, z], axis=1)[wrong])
-    return np.concatenate(found)
+            triplets.append(np.stack([x, y, z], axis=1)[wrong])
+    return np.concatenate(triplets)
 
 
 def _among_copies(placed: Placed, known: F64, triples: I64) -> Bools:

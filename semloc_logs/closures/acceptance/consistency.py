@@ -66,10 +66,10 @@ def count_votes(
     for (query, _), rows in pairs.items():
         group = placed.part(rows)
         road = roads[query]
-        near = NEAR * voxel_size / STREET_VOXEL
+        reach = NEAR * voxel_size / STREET_VOXEL
         votes.neighbours[rows] = (
-            np.searchsorted(road, group.road + near, "right")
-            - np.searchsorted(road, group.road - near, "left")
+            np.searchsorted(road, group.road + reach, "right")
+            - np.searchsorted(road, group.road - reach, "left")
             - 1.0
         )
         sums, sums_ignoring_rivals = _sums(

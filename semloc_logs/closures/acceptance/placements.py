@@ -92,8 +92,8 @@ def pairs_of(placed: Placed) -> Pairs:
     )
     query = number[: len(placed)]
     target = number[len(placed) :]
-    at = placed.target_T_query[:, :3, 3]
-    rows = np.lexsort((at[:, 2], at[:, 1], at[:, 0], placed.query, target, query))
+    centre = placed.target_T_query[:, :3, 3]
+    rows = np.lexsort((centre[:, 2], centre[:, 1], centre[:, 0], placed.query, target, query))
     cuts = np.flatnonzero(np.diff(query[rows] * len(names) + target[rows])) + 1
     return {
         (str(names[query[r[0]]]), str(names[target[r[0]]])): r

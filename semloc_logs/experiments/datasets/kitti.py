@@ -47,8 +47,8 @@ def _recordings(folder: Path, *, semantic: bool) -> list[Recording]:
     sequences = sorted(p for p in (folder / "sequences").glob("*") if (p / "velodyne").is_dir())
     if semantic:
         sequences = [p for p in sequences if (p / "labels").is_dir()]
-    found = [(p, _poses_file(folder, p, semantic=semantic)) for p in sequences]
-    out = [_recording(p, poses, semantic=semantic) for p, poses in found if poses is not None]
+    recordings = [(p, _poses_file(folder, p, semantic=semantic)) for p in sequences]
+    out = [_recording(p, poses, semantic=semantic) for p, poses in recordings if poses is not None]
     if not out:
         wanted = "velodyne/, labels/ and poses.txt" if semantic else "velodyne/ and poses/NN.txt"
         raise LogError(f"{folder} has no sequences/NN/ with {wanted}: give the folder above them.")

@@ -249,14 +249,14 @@ def sequences_with(folder: Path, part: str, wanted: str) -> list[Path]:
 
     LogError without any; ``wanted`` tells in words what to give instead.
     """
-    found = [folder] if (folder / part).is_dir() else sorted(folder.glob("*/"))
-    found = [p for p in found if (p / part).is_dir()]
-    if not found:
+    folders = [folder] if (folder / part).is_dir() else sorted(folder.glob("*/"))
+    folders = [p for p in folders if (p / part).is_dir()]
+    if not folders:
         raise LogError(f"{folder} has no {part}/: give {wanted}.")
-    return found
+    return folders
 
 
 def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
     """The files of a folder whose names are numbers, in their order."""
-    found = [(int(p.stem), p) for p in folder.glob(f"*{ending}") if p.stem.isdigit()]
-    return sorted(found)
+    frames = [(int(p.stem), p) for p in folder.glob(f"*{ending}") if p.stem.isdigit()]
+    return sorted(frames)

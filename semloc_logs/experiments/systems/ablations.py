@@ -194,12 +194,12 @@ class _Ablated(Ours):
         return super()._ranked(context)
 
     def _hypotheses(self, context: QueryContext) -> list[Hypothesis]:
-        found = find_hypotheses(context, self.row.match)
+        hypotheses = find_hypotheses(context, self.row.match)
         if not self.row.contradicts:
-            for group in {h.group for h in found}:
+            for group in {h.group for h in hypotheses}:
                 target = context.visible.target(group)
                 target.__dict__["mask_grid"] = without_free_space(target.mask_grid)
-        return found
+        return hypotheses
 
     def _aligned(self, context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
         return super()._aligned(context, candidates) if self.row.fitted else []

@@ -169,15 +169,15 @@ def entries(names: Iterable[str] = ()) -> list[Entry]:
         entry.name: (entry,) for entry in (*OURS, *BASELINES, *ABLATIONS)
     }
     known |= {f"all-{name}": group for name, group in GROUPS.items()}
-    found: dict[str, Entry] = {}
+    by_name: dict[str, Entry] = {}
     for name in [*names] or ["all-ours", "all-baselines"]:
         if name not in known:
             raise SettingsError(
                 f"Unknown system '{name}'.{did_you_mean(name, known)} "
                 f"There are {', '.join(known) or 'none'}."
             )
-        found |= {entry.name: entry for entry in known[name]}
-    return [*found.values()]
+        by_name |= {entry.name: entry for entry in known[name]}
+    return [*by_name.values()]
 
 
 def make_system(entry: Entry, options: SystemOptions) -> System:

@@ -98,8 +98,8 @@ def _fused(views: Iterable[tuple[View, F64]], settings: Resolved, radius: float)
             points = view.points[rows]
             label = view.label[rows]
             off = points - origin.astype(np.float32)
-            near = np.einsum("ij,ij->i", off, off) < radius**2
-            fuser.add(points[near], label[near], origin, None, pose)
+            is_inside = np.einsum("ij,ij->i", off, off) < radius**2
+            fuser.add(points[is_inside], label[is_inside], origin, None, pose)
             seen_from.append(pose[:3, :3] @ origin + pose[:3, 3])
     return LevelMap(
         fuser.finish(),

@@ -101,9 +101,9 @@ class Ours:
         searched = verify_hypotheses(context, hypotheses)
         fitted = [a for candidates in searched for a in self._aligned(context, candidates)]
         scores = [self._score(a) for a in fitted]
-        found: list[RankedPose] = []
+        poses: list[RankedPose] = []
         for i in np.argsort(-np.array(scores), kind="stable").tolist():
-            self._add(found, RankedPose(self._fitted_pose(fitted[i]), scores[i]))
+            self._add(poses, RankedPose(self._fitted_pose(fitted[i]), scores[i]))
         worst = min(scores, default=0.0)
         by_score = sorted(chain.from_iterable(searched), key=lambda c: -c.score)
         by_weight = sorted(hypotheses, key=lambda h: -h.weight)
@@ -113,16 +113,16 @@ class Ours:
         )
         for rank, (group, target_T_query) in enumerate(rest, 1):
             pose = self._world_T_map_of(group) @ target_T_query @ context.query_T_base
-            self._add(found, RankedPose(pose, worst - rank))
-        return found
+            self._add(poses, RankedPose(pose, worst - rank))
+        return poses
 
-    def _add(self, found: list[RankedPose], pose: RankedPose) -> None:
-        """Append ``pose`` where there is room and its place is not ``found`` yet."""
+    def _add(self, poses: list[RankedPose], pose: RankedPose) -> None:
+        """Append ``pose`` where there is room and its place is not ``poses`` yet."""
         v = self.settings.fusion.voxel_size
-        if len(found) < MOST_POSES and not any(
-            same_place(pose.world_T_base, f.world_T_base, v) for f in found
+        if len(poses) < MOST_POSES and not any(
+            same_place(pose.world_T_base, f.world_T_base, v) for f in poses
         ):
-            found.append(pose)
+            poses.append(pose)
 
     def _hypotheses(self, context: QueryContext) -> list[Hypothesis]:
         return find_hypotheses(context)

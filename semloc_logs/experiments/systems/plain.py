@@ -167,8 +167,8 @@ class Plain:
             centre = sensor_centre(view)
             kept = thin(view.points, fusion.keyframe_resolution)
             off = view.points[kept] - centre
-            near = (view.label[kept] != SKY) & (np.einsum("ij,ij->i", off, off) < radius**2)
-            kept = kept[near]
+            is_inside = (view.label[kept] != SKY) & (np.einsum("ij,ij->i", off, off) < radius**2)
+            kept = kept[is_inside]
             label = view.label[kept]
             if self.variant == "geometric":
                 label = np.full_like(label, SINGLE_LABEL)
@@ -218,7 +218,7 @@ class Plain:
         ranked = best_overlaps(
             database.target, voxels, groups, min(plain.refined, MOST_POSES), plain.min_tau
         )
-        found = []
+        answers = []
         for hypothesis in ranked:
             group = groups[hypothesis.group]
             start = np.eye(4)
@@ -227,8 +227,8 @@ class Plain:
             pose, tau = refined(database.target, voxels, start, plain.iterations)
             world_T_query = pose.copy()
             world_T_query[:3, 3] = v * pose[:3, 3] + database.origin
-            found.append(RankedPose(world_T_query @ poses[-1], tau))
-        return sorted(found, key=lambda pose: -pose.score)
+            answers.append(RankedPose(world_T_query @ poses[-1], tau))
+        return sorted(answers, key=lambda pose: -pose.score)
 
     def hypotheses(self, blocks: BlockMap) -> list[Shifts]:
         """One for each match of a word of the query map, in voxels, equal ones once."""

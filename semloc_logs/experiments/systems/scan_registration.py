@@ -68,8 +68,8 @@ class Contexts:
         self._known.append(scan_context(points))
 
     def nearest(self, points: F32, count: int) -> list[tuple[int, F64]]:
-        found = nearest_contexts(scan_context(points), self._known, count)
-        return [(number, yaw_transform(yaw)) for number, yaw in found]
+        order = nearest_contexts(scan_context(points), self._known, count)
+        return [(number, yaw_transform(yaw)) for number, yaw in order]
 
 
 class DensityMaps:
@@ -91,10 +91,10 @@ class DensityMaps:
 
     def nearest(self, points: F32, count: int) -> list[tuple[int, F64]]:
         self._asked += 1
-        found = self._closures.get_closures(
+        closures = self._closures.get_closures(
             APART * (self._count + self._asked), *_with_normals(points)
         )
-        known = [c for c in found if c.source_id < APART * self._count]
+        known = [c for c in closures if c.source_id < APART * self._count]
         known.sort(key=lambda c: -c.number_of_inliers)
         # its pose leads from the scan to the points
         return [(c.source_id // APART, inverse(np.asarray(c.pose))) for c in known[:count]]
@@ -154,15 +154,15 @@ class ScanSystem:
         query_T_scan = level_pose(query_T_base)
         scan = _thinned(apply(inverse(query_T_scan), points))
         scan_T_base = inverse(query_T_scan) @ query_T_base
-        found = []
+        answers = []
         for number, start in self._places.nearest(scan, self._candidates):
             stored = self._scans[number]
             pose, score = self._register(
                 np.load(stored.path).astype(np.float64), scan.astype(np.float64), start
             )
             if score > 0:
-                found.append(RankedPose(stored.world_T_scan @ pose @ scan_T_base, score))
-        return sorted(found, key=lambda pose: -pose.score)[:MOST_POSES]
+                answers.append(RankedPose(stored.world_T_scan @ pose @ scan_T_base, score))
+        return sorted(answers, key=lambda pose: -pose.score)[:MOST_POSES]
 
 
 def level_pose(level_T_base: F64) -> F64:
@@ -220,13 +220,13 @@ def kiss_matcher() -> Register:
 
     def register(target: F64, query: F64, start: F64) -> tuple[F64, float]:
         matcher = library.KISSMatcher(library.KISSMatcherConfig(KISS_VOXEL))
-        found = matcher.estimate(query.astype(np.float32), target.astype(np.float32))
+        result = matcher.estimate(query.astype(np.float32), target.astype(np.float32))
         inliers = int(matcher.get_num_final_inliers())
-        if not found.valid or inliers < LEAST_KISS_INLIERS:
+        if not result.valid or inliers < LEAST_KISS_INLIERS:
             return start, 0.0
         pose = np.eye(4)
-        pose[:3, :3] = np.asarray(found.rotation)
-        pose[:3, 3] = np.asarray(found.translation).ravel()
+        pose[:3, :3] = np.asarray(result.rotation)
+        pose[:3, 3] = np.asarray(result.translation).ravel()
         return pose, float(inliers)
 
     return register

@@ -307,13 +307,13 @@ def _own_metadata(file: BinaryIO, tail: _Tail) -> Metadata | None:
         if record[: HEAD.size] != HEAD.pack(Opcode.METADATA, length - HEAD.size):
             continue
         try:
-            found: Metadata = parse(Metadata.read, record[HEAD.size :])
-            start = int(found.metadata["start"])
-            digest = found.metadata["records_sha256"]
+            metadata: Metadata = parse(Metadata.read, record[HEAD.size :])
+            start = int(metadata.metadata["start"])
+            digest = metadata.metadata["records_sha256"]
         except (KeyError, ValueError, LogError):
             continue
         if len(MAGIC) < start <= offset and hash_range(file, start, offset).hexdigest() == digest:
-            return found
+            return metadata
     return None
 
 

@@ -280,7 +280,7 @@ def _guarded(log: Path, reader: Any, memory: Memory) -> Iterator[tuple[Any, int,
         return bytes(unpack_whole(data, memory))
 
     reader.chunks = {
-        at: chunk._replace(decompressor=bounded) for at, chunk in reader.chunks.items()
+        start: chunk._replace(decompressor=bounded) for start, chunk in reader.chunks.items()
     }
     with _told(log):
         messages = reader.messages(reader.connections) if reader.connections else iter(())

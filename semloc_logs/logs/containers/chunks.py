@@ -87,8 +87,8 @@ class CompactIndex:
 
 def new_index(size: int, memory: Memory) -> Index:
     """An index for a chunk of ``size`` bytes."""
-    found: list[Entry] = []
-    return CompactIndex(memory) if size > LARGE else found
+    entries: list[Entry] = []
+    return CompactIndex(memory) if size > LARGE else entries
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +118,14 @@ def chunk_messages(chunk: Chunk, memory: Memory) -> Iterator[MessageOrTime]:
 
 def _kept(chunk: Chunk, memory: Memory) -> Iterator[Message]:
     data = chunk.unpack()
-    found: list[Entry] = []
-    chunk.walk(data, found)
-    found.sort(key=itemgetter(0))  # stable, and nearly free for sorted input
+    entries: list[Entry] = []
+    chunk.walk(data, entries)
+    entries.sort(key=itemgetter(0))  # stable, and nearly free for sorted input
     view = memory.counted(data)
     del data
-    kinds = {channel: chunk.kind(channel) for channel in sorted({entry[1] for entry in found})}
-    with memory.held(_ENTRY_BYTES * len(found)):
-        for time, channel, start, end in found:
+    kinds = {channel: chunk.kind(channel) for channel in sorted({entry[1] for entry in entries})}
+    with memory.held(_ENTRY_BYTES * len(entries)):
+        for time, channel, start, end in entries:
             if (kind := kinds[channel]) is not None:
                 topic, type_, encoding, definition, publisher = kind
                 content = view[start:end]

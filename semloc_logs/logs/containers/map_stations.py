@@ -76,7 +76,7 @@ def tour(xyz: F64) -> Stations:
     # the base looks along the tour
     step = np.gradient(stations[:, :2], axis=0) if len(stations) > 1 else np.ones((1, 2))
     yaw = np.arctan2(step[:, 1], step[:, 0])
-    poses = np.array([yaw_transform(*at) for at in zip(yaw, stations, strict=True)])
+    poses = np.array([yaw_transform(*station) for station in zip(yaw, stations, strict=True)])
     return Stations(FIRST_NS + (way / SPEED * 1e9).astype(np.int64), poses, is_tour=True)
 
 
@@ -125,19 +125,19 @@ def _in_turn(stations: F64) -> F64:
     """The same, each followed by the nearest that is left."""
     left = np.ones(len(stations), bool)
     tree = cKDTree(stations)
-    at = 0
-    order = [at]
-    left[at] = False
+    here = 0
+    order = [here]
+    left[here] = False
     while left.any():
         k = 8
-        near = np.zeros(0, np.int64)
-        while not len(near):
+        nearest_stations = np.zeros(0, np.int64)
+        while not len(nearest_stations):
             k = min(2 * k, len(stations))
-            _, found = tree.query(stations[at], k)
-            near = found[left[found]]
-        at = int(near[0])
-        order.append(at)
-        left[at] = False
+            _, neighbours = tree.query(stations[here], k)
+            nearest_stations = neighbours[left[neighbours]]
+        here = int(nearest_stations[0])
+        order.append(here)
+        left[here] = False
     return stations[order]
 
 

@@ -286,12 +286,12 @@ class McapLog(BaseLog):
 
     def _scan_chunk(self, offset: int, size: int, counts: Counter[int]) -> None:
         data = self._unpack_chunk(offset, size)
-        found = new_index(len(data), self._memory)
-        self._walk(offset, data, found)
-        if len(found):
-            start_ns = min(entry[0] for entry in found)
-            end_ns = max(entry[0] for entry in found)
-            by_channel = Counter(entry[1] for entry in found)
+        index = new_index(len(data), self._memory)
+        self._walk(offset, data, index)
+        if len(index):
+            start_ns = min(entry[0] for entry in index)
+            end_ns = max(entry[0] for entry in index)
+            by_channel = Counter(entry[1] for entry in index)
             counts.update({c: n for c, n in by_channel.items() if c in self._channels})
             self._parts.append(Part(offset, size, start_ns, end_ns, frozenset(by_channel), True))
 
@@ -384,15 +384,15 @@ class McapLog(BaseLog):
         read_into(self._file, offset, record, self._size)
         return record
 
-    def _walk(self, offset: int, data: Bytes, found: Index) -> None:
-        """Puts (log time, channel, start, end) of the messages in ``data`` into ``found``.
+    def _walk(self, offset: int, data: Bytes, index: Index) -> None:
+        """Puts (log time, channel, start, end) of the messages in ``data`` into ``index``.
 
         Learns of schemas and channels on the way.
         """
         unpack = MESSAGE.unpack_from
         record_size = HEAD.size
         message = int(Opcode.MESSAGE)
-        append = found.append
+        append = index.append
         try:
             for opcode, start, end in spans(data):
                 if opcode == message:
@@ -405,7 +405,7 @@ class McapLog(BaseLog):
         except LogError as error:
             self._problems.add(
                 f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; "
-                f"{len(found)} messages of it are used."
+                f"{len(index)} messages of it are used."
             )
 
     def _define(self, opcode: int, body: bytes) -> None:

@@ -93,12 +93,12 @@ def scan(file: BinaryIO, data_end: int, path: Path, memory: Memory) -> Summary:
     Chunks are decompressed one at a time and their checksums verified. Raises ``LogError`` where a
     record does not fit, is damaged, or is too large for ``memory``.
     """
-    found = _Found(memory)
+    contents = _Found(memory)
     offset = end = len(MAGIC)
     try:
         for opcode, start, size in walk(file, offset, data_end):
             offset = start
-            _visit(found, file, opcode, offset, size)
+            _visit(contents, file, opcode, offset, size)
             end = offset + size
         if end != data_end:
             offset = end
@@ -108,39 +108,39 @@ def scan(file: BinaryIO, data_end: int, path: Path, memory: Memory) -> Summary:
             f"{path} is damaged at offset {offset} ({error}) and has no complete summary; "
             f"recover it with `mcap recover {path} -o OUT.mcap`."
         ) from error
-    return _summarise(found)
+    return _summarise(contents)
 
 
-def _visit(found: _Found, file: BinaryIO, opcode: int, offset: int, size: int) -> None:
+def _visit(contents: _Found, file: BinaryIO, opcode: int, offset: int, size: int) -> None:
     """Note one record of ``size`` bytes; the file is at the start of its body."""
     length = size - HEAD.size
     if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK):
-        found.memory.check(length)
+        contents.memory.check(length)
     if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        found.definition(opcode, HEAD.pack(opcode, length) + file.read(length))
+        contents.definition(opcode, HEAD.pack(opcode, length) + file.read(length))
     elif opcode == Opcode.MESSAGE:
-        found.message(file.read(min(length, MESSAGE_BODY)))
-        found.loose += 1
+        contents.message(file.read(min(length, MESSAGE_BODY)))
+        contents.loose += 1
     elif opcode == Opcode.CHUNK:
-        _visit_chunk(found, HEAD.pack(opcode, length) + file.read(length), offset)
-    elif opcode == Opcode.MESSAGE_INDEX and found.chunks:
+        _visit_chunk(contents, HEAD.pack(opcode, length) + file.read(length), offset)
+    elif opcode == Opcode.MESSAGE_INDEX and contents.chunks:
         channel, entries = struct.unpack("<HI", file.read(6))
-        chunk = found.chunks[-1]
+        chunk = contents.chunks[-1]
         # writers differ on whether a channel without messages in the chunk gets an index; one
         # without entries tells nothing
         if entries:
-            found.keep(_ENTRY_BYTES)
+            contents.keep(_ENTRY_BYTES)
             chunk.message_index_offsets[channel] = offset
         chunk_end = chunk.chunk_start_offset + chunk.chunk_length
         chunk.message_index_length = offset + size - chunk_end
     elif opcode == Opcode.ATTACHMENT:
         body = file.read(min(length, MAX_NAMES))
-        found.keep(_RECORD_BYTES + len(body))
-        found.attachments.append(parse(_attachment_index(offset, size), body))
+        contents.keep(_RECORD_BYTES + len(body))
+        contents.attachments.append(parse(_attachment_index(offset, size), body))
     elif opcode == Opcode.METADATA:
         name = parse(ReadDataStream.read_prefixed_string, file.read(min(length, MAX_NAMES)))
-        found.keep(_RECORD_BYTES + len(name))
-        found.metadata.append(MetadataIndex(offset, size, name))
+        contents.keep(_RECORD_BYTES + len(name))
+        contents.metadata.append(MetadataIndex(offset, size, name))
 
 
 def _attachment_index(offset: int, size: int) -> Callable[[ReadDataStream], AttachmentIndex]:
@@ -155,16 +155,16 @@ def _attachment_index(offset: int, size: int) -> Callable[[ReadDataStream], Atta
     return read
 
 
-def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
+def _visit_chunk(contents: _Found, record: bytes, offset: int) -> None:
     head = chunk_head(record)
-    data = chunk_records(record, head, found.memory)
-    found.keep(_RECORD_BYTES)
+    data = chunk_records(record, head, contents.memory)
+    contents.keep(_RECORD_BYTES)
     for opcode, start, stop in spans(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            found.definition(opcode, bytes(data[start - HEAD.size : stop]))
+            contents.definition(opcode, bytes(data[start - HEAD.size : stop]))
         elif opcode == Opcode.MESSAGE:
-            found.message(bytes(data[start : min(stop, start + MESSAGE_BODY)]))
-    found.chunks.append(
+            contents.message(bytes(data[start : min(stop, start + MESSAGE_BODY)]))
+    contents.chunks.append(
         ChunkIndex(
             chunk_length=len(record),
             chunk_start_offset=offset,
@@ -179,26 +179,26 @@ def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
     )
 
 
-def _summarise(found: _Found) -> Summary:
+def _summarise(contents: _Found) -> Summary:
     statistics = Statistics(
-        attachment_count=len(found.attachments),
-        channel_count=len(found.channels),
-        channel_message_counts=dict(sorted(found.counts.items())),
-        chunk_count=len(found.chunks),
-        message_count=sum(found.counts.values()),
-        message_end_time=found.end_ns,
-        message_start_time=found.start_ns or 0,
-        metadata_count=len(found.metadata),
-        schema_count=len(found.schemas),
+        attachment_count=len(contents.attachments),
+        channel_count=len(contents.channels),
+        channel_message_counts=dict(sorted(contents.counts.items())),
+        chunk_count=len(contents.chunks),
+        message_count=sum(contents.counts.values()),
+        message_end_time=contents.end_ns,
+        message_start_time=contents.start_ns or 0,
+        metadata_count=len(contents.metadata),
+        schema_count=len(contents.schemas),
     )
     # where some messages lie outside of chunks, an index of the chunks would hide them from readers
-    chunks = [] if found.loose else found.chunks
+    chunks = [] if contents.loose else contents.chunks
     groups: dict[int, list[bytes]] = {
-        Opcode.SCHEMA: [found.schemas[k] for k in sorted(found.schemas)],
-        Opcode.CHANNEL: [found.channels[k] for k in sorted(found.channels)],
+        Opcode.SCHEMA: [contents.schemas[k] for k in sorted(contents.schemas)],
+        Opcode.CHANNEL: [contents.channels[k] for k in sorted(contents.channels)],
         Opcode.STATISTICS: [raw(statistics)],
         Opcode.CHUNK_INDEX: [raw(i) for i in chunks],
-        Opcode.ATTACHMENT_INDEX: [raw(i) for i in found.attachments],
-        Opcode.METADATA_INDEX: [raw(i) for i in found.metadata],
+        Opcode.ATTACHMENT_INDEX: [raw(i) for i in contents.attachments],
+        Opcode.METADATA_INDEX: [raw(i) for i in contents.metadata],
     }
-    return Summary(groups, statistics, found.loose)
+    return Summary(groups, statistics, contents.loose)

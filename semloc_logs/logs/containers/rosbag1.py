@@ -293,8 +293,8 @@ class Rosbag1Log(BaseLog):
         size = _number(fields, b"size", "<I")
         return decompress(self._read(start, end), compression, size, self._memory)
 
-    def _walk(self, offset: int, data: Bytes, found: Index) -> None:
-        """Puts (log time, connection, start, end) of the messages in ``data`` into ``found``.
+    def _walk(self, offset: int, data: Bytes, index: Index) -> None:
+        """Puts (log time, connection, start, end) of the messages in ``data`` into ``index``.
 
         Learns of connections on the way.
         """
@@ -306,7 +306,7 @@ class Rosbag1Log(BaseLog):
                 op = fields.get(b"op")
                 if op == b"\x02":
                     connection = _number(fields, b"conn", "<I")
-                    found.append((_time(fields, b"time"), connection, start, end))
+                    index.append((_time(fields, b"time"), connection, start, end))
                 elif op == b"\x07":
                     connection = _number(fields, b"conn", "<I")
                     if connection not in self._connections:
@@ -315,7 +315,7 @@ class Rosbag1Log(BaseLog):
         except LogError as error:
             self._problems.add(
                 f"{self.path.name}: the chunk at byte {offset} is damaged inside: {error}; "
-                f"{len(found)} messages of it are used."
+                f"{len(index)} messages of it are used."
             )
 
     def _read(self, start: int, end: int) -> bytes:

@@ -71,14 +71,14 @@ def side_files(path: Path) -> list[Path]:
 
 def state(path: Path) -> tuple[object, ...]:
     """Changes when the content of ``path`` does."""
-    found: list[object] = []
+    parts: list[object] = []
     for file in (path, _beside(path, "-wal"), _beside(path, "-journal")):
         try:
             status = file.stat()
-            found += [status.st_size, status.st_mtime_ns]
+            parts += [status.st_size, status.st_mtime_ns]
         except OSError:
-            found.append(None)
-    return tuple(found)
+            parts.append(None)
+    return tuple(parts)
 
 
 def _beside(path: Path, suffix: str) -> Path:
@@ -260,10 +260,10 @@ class OverlaidFile(apsw.VFSFile):
         if self._overlay is None:
             return self._read(0, amount, offset)
         page, inside = divmod(offset, self._overlay.page_size)
-        at = self._overlay.pages.get(page + 1)
-        if at is None:
+        start = self._overlay.pages.get(page + 1)
+        if start is None:
             return self._read(0, amount, offset)
-        return self._read(1, amount, at + inside)
+        return self._read(1, amount, start + inside)
 
     def _read(self, file: int, amount: int, offset: int) -> bytes:
         self._files[file].seek(offset)

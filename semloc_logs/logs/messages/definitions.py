@@ -147,7 +147,7 @@ def _idl_types(text: str) -> dict[str, Any]:
     types: dict[str, Any] = {}
     for section in text.split(_IDL_SEPARATOR):
         body = section.partition("\n")[2] if section.startswith("IDL: ") else section
-        body = _IDL_NOISE.sub(lambda found: '""' if found[0][0] == '"' else " ", body)
+        body = _IDL_NOISE.sub(lambda match: '""' if match[0][0] == '"' else " ", body)
         # constants are computed by the parser, and a few lines could ask for a number without end
         if "<<" in body or "*" in body:
             raise UndecodableError("its definition computes constants, which is not supported")

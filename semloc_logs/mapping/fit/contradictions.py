@@ -63,8 +63,8 @@ def add_strangers(
     beside = {place[pair] + step for pair in lost for step in (-1, 1)}
     untold = [everything[n] for n in sorted(beside) if 0 <= n < len(everything)]
     untold = [pair for pair in untold if pair not in numbers]
-    found = registered(clouds, untold).numbers.tolist() if untold else []
-    lost += [pair for pair in untold if list(pair) not in found]
+    registered_pairs = registered(clouds, untold).numbers.tolist() if untold else []
+    lost += [pair for pair in untold if list(pair) not in registered_pairs]
     rows = np.array(sorted(place[pair] for pair in lost), np.int64)
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     rows = np.concatenate([run for run in runs if len(run) >= LEAST_STRANGERS] or [rows[:0]])
@@ -83,66 +83,69 @@ def add_strangers(
 
 
 def add_unexplained(
-    stream: StreamFit, found: Registered, poses_at: PosesAt, clouds: Clouds
+    stream: StreamFit, registration: Registered, poses_at: PosesAt, clouds: Clouds
 ) -> None:
     """Names a camera most of whose pairs move otherwise than the poses, far beyond its noise."""
-    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
+    squares = registration.pairs.squares(
+        pose_motion(registration.pairs, poses_at, np.zeros(PARAMETERS))
+    )
     is_off = stream.translation_m > MOST_OFF * clouds.voxel or stream.rotation_rad > MOST_TURNED
     usual = float(np.nanmedian(squares))
-    if not is_off or usual < UNEXPLAINED or usual < UNEXPLAINED * noise(clouds, found):
+    if not is_off or usual < UNEXPLAINED or usual < UNEXPLAINED * noise(clouds, registration):
         return
     stream.findings.append(
         Finding(
             Severity.WRONG,
             f"most of its clouds move otherwise than the poses, by {stream.translation_m:.2f} m and"
             f" {np.degrees(stream.rotation_rad):.1f} degrees in the median of"
-            f" {len(found.pairs)} pairs, and no offset of a clock or a mounting explains it: its"
-            " calibration (CameraInfo, K, baseline, unit of depth) or the poses are wrong",
+            f" {len(registration.pairs)} pairs, and no offset of a clock or a mounting explains it:"
+            " its calibration (CameraInfo, K, baseline, unit of depth) or the poses are wrong",
         )
     )
 
 
 def add_contradictions(
     stream: StreamFit,
-    found: Registered,
+    registration: Registered,
     poses_at: PosesAt,
     clouds: Clouds,
     severity: Severity,
 ) -> None:
     """Names the time where clouds move otherwise than the poses, and nothing else explains it."""
-    predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
-    squares = found.pairs.squares(predicted)
-    off = difference(found.pairs.measured, predicted)
+    predicted = pose_motion(registration.pairs, poses_at, np.zeros(PARAMETERS))
+    squares = registration.pairs.squares(predicted)
+    off = difference(registration.pairs.measured, predicted)
     meters = np.linalg.norm(off[:, :3], axis=1)
     radians = np.linalg.norm(off[:, 3:], axis=1)
     with np.errstate(invalid="ignore"):
-        gain = found.share / np.maximum(found.given_share, 1e-9)
-        is_other = (gain > CONTRADICTS) & (found.share > TELLING)
-        is_other |= (gain > FEW_CONTRADICT) & (found.share > FEW_TELLING)
+        gain = registration.share / np.maximum(registration.given_share, 1e-9)
+        is_other = (gain > CONTRADICTS) & (registration.share > TELLING)
+        is_other |= (gain > FEW_CONTRADICT) & (registration.share > FEW_TELLING)
         is_other &= squares > CONTRADICTION
         is_other &= (meters > WRONG * clouds.voxel) | (radians > WRONG_TURN)
     if not is_other.any():
         return
     # where most pairs are off, their median does not show the noise
     usual = float(np.nanmedian(squares)) / MEDIAN_OF_6
-    excess = max(1.0, min(usual, noise(clouds, found)))
+    excess = max(1.0, min(usual, noise(clouds, registration)))
     rows = np.flatnonzero(is_other & (squares > CONTRADICTION * excess))
     # single ones are registrations that went wrong
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     rows = np.concatenate([run for run in runs if len(run) >= LEAST_CONTRADICTIONS] or [rows[:0]])
     if not len(rows):
         return
-    first = int(found.pairs.stamps_ns[rows].min())
-    last = int(found.pairs.stamps_ns[rows].max())
+    first = int(registration.pairs.stamps_ns[rows].min())
+    last = int(registration.pairs.stamps_ns[rows].max())
     farthest = float(meters[rows].max())
     most_turned = float(np.degrees(radians[rows].max()))
     stream.findings.append(
         Finding(
             severity,
-            f"{len(rows)} of {len(found.pairs)} pairs of its clouds move otherwise than the poses,"
-            f" by up to {farthest:.1f} m and {most_turned:.0f} degrees ({time_range(first, last)}):"
-            f" the poses are wrong there{_drift_text(off[rows], predicted[rows])}; cut the log, or"
-            " give others with --poses FILE",
+            f"{len(rows)} of {len(registration.pairs)} pairs of its clouds move otherwise than the"
+            f" poses, by up to {farthest:.1f} m and {most_turned:.0f} degrees"
+            f" ({time_range(first, last)}): the poses are wrong"
+            f" there{_drift_text(off[rows], predicted[rows])}; cut the log, or give others with"
+            " --poses FILE",
         )
     )
 

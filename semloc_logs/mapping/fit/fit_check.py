@@ -172,8 +172,8 @@ def check_stream(
         return _far_off(topic, clouds, poses_at, numbers, given)
     given = searched(clouds, given)
     others = [registered(clouds, numbers, start) for start in _starts(clouds, poses_at, given)]
-    for found in sorted(others, key=_share, reverse=True):
-        stream = _judged(topic, clouds, poses_at, found)
+    for registration in sorted(others, key=_share, reverse=True):
+        stream = _judged(topic, clouds, poses_at, registration)
         if stream.findings:
             return stream
     stream = _judged(topic, clouds, poses_at, given)
@@ -204,10 +204,10 @@ def _far_off(
     unknown = StreamFit(topic, len(given.pairs))
     if len(numbers) < LEAST_PAIRS:
         return unknown
-    found = registered(clouds, numbers, lambda target, source: np.eye(4))
-    if len(found.pairs) < LEAST_PAIRS or float(np.median(found.share)) < TELLING:
+    unmoved = registered(clouds, numbers, lambda target, source: np.eye(4))
+    if len(unmoved.pairs) < LEAST_PAIRS or float(np.median(unmoved.share)) < TELLING:
         return unknown
-    stream = _judged(topic, clouds, poses_at, found)
+    stream = _judged(topic, clouds, poses_at, unmoved)
     return stream if stream.findings else unknown
 
 
@@ -220,22 +220,22 @@ def _in_other_unit(
         return None
     coarse = replace(clouds, voxel=COARSER * clouds.voxel)
     numbers = choose(coarse, FEWEST_PAIRS)
-    found = registered(coarse, numbers)
-    far = other_distance(coarse, found) if len(found.pairs) >= LEAST_PAIRS else None
+    in_cells = registered(coarse, numbers)
+    far = other_distance(coarse, in_cells) if len(in_cells.pairs) >= LEAST_PAIRS else None
     if far is None:
         return None
     longer = registered(coarse, numbers, far)
-    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
-    for start in Doubted.of(coarse, found, squares).motions():
+    squares = in_cells.pairs.squares(pose_motion(in_cells.pairs, poses_at, np.zeros(PARAMETERS)))
+    for start in Doubted.of(coarse, in_cells, squares).motions():
         if _share(registered(coarse, numbers, start)) > _share(longer):
             return None  # such as other axes
     stream = _judged(topic, coarse, poses_at, longer)
     return stream if stream.findings else None
 
 
-def _share(found: Registered) -> float:
+def _share(registration: Registered) -> float:
     """The points on planes, as shares summed over the pairs."""
-    return float(found.share.sum())
+    return float(registration.share.sum())
 
 
 def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:
@@ -252,9 +252,9 @@ def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[St
             yield other
 
 
-def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) -> StreamFit:
+def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, registration: Registered) -> StreamFit:
     """The faults that explain registered pairs."""
-    pairs = found.pairs
+    pairs = registration.pairs
     zero = np.zeros(PARAMETERS)
     none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
     off = difference(pairs.measured, pose_motion(pairs, poses_at, zero))
@@ -270,7 +270,9 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
     estimate, faults = _explained(pairs, poses_at, none)
     if faults:
         # a registration from there ends at the right motion where others did not
-        refined = registered(clouds, found.numbers.tolist(), _start(clouds, poses_at, estimate))
+        refined = registered(
+            clouds, registration.numbers.tolist(), _start(clouds, poses_at, estimate)
+        )
         pairs = refined.pairs
         none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
         estimate, faults = _explained(pairs, poses_at, none)
@@ -278,7 +280,7 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         stream.findings.append(Finding(Severity.WRONG, reading))
         return stream
     rest = float(np.nanmedian(estimate.squares))
-    if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
+    if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, registration):
         drift = clock_drift(pairs, poses_at, estimate)
         if drift is not None and drift.is_sure and _drift_effect(drift, clouds) >= WRONG:
             stream.findings.append(Finding(Severity.WRONG, clock_drift_text(drift)))

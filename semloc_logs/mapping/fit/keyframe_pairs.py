@@ -286,7 +286,7 @@ def registered(
     return _kept(clouds, numbers, fits, np.array(given_shares))
 
 
-def noise(clouds: Clouds, found: Registered) -> float:
+def noise(clouds: Clouds, registration: Registered) -> float:
     """How many times the squares of registrations are as large as their covariances have them; 1 at
     least.
 
@@ -294,14 +294,14 @@ def noise(clouds: Clouds, found: Registered) -> float:
     planes of the other cloud.
     """
     registrar = Registrar(clouds)
-    rows = evenly(len(found.pairs), THERE_AND_BACK)
+    rows = evenly(len(registration.pairs), THERE_AND_BACK)
     squares = []
     for row in rows.tolist():
-        target, source = found.numbers[row].tolist()
-        there = found.pairs.measured[row]
+        target, source = registration.numbers[row].tolist()
+        there = registration.pairs.measured[row]
         back = inverse(registrar.fit(source, target, [inverse(there)]).target_T_source)
         off = difference(there[None], back[None])[0]
-        squares.append(float(off @ np.linalg.solve(2 * found.pairs.covariance[row], off)))
+        squares.append(float(off @ np.linalg.solve(2 * registration.pairs.covariance[row], off)))
     return max(1.0, float(np.median(squares)) / MEDIAN_OF_6)
 
 

@@ -46,12 +46,14 @@ class Doubted:
     given_share: float
 
     @staticmethod
-    def of(clouds: Clouds, found: Registered, squares: F64) -> Doubted:
-        """Those of ``found``, with their squared distances (n,) to the poses."""
+    def of(clouds: Clouds, registration: Registered, squares: F64) -> Doubted:
+        """Those of ``registration``, with their squared distances (n,) to the poses."""
         worst = np.argsort(-squares, kind="stable")[:TRIED]
         rows = np.union1d(worst, evenly(len(squares), TRIED))
-        share, given_share = (float(s[rows].sum()) for s in (found.share, found.given_share))
-        return Doubted(clouds, found.numbers[rows], share, given_share)
+        share, given_share = (
+            float(s[rows].sum()) for s in (registration.share, registration.given_share)
+        )
+        return Doubted(clouds, registration.numbers[rows], share, given_share)
 
     def motions(self) -> list[Start]:
         """Other axes, units or none at all, where they bring far more points onto planes.

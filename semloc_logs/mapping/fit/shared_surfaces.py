@@ -81,23 +81,23 @@ def offset_between(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> Offset:
     both, numbers = _pairs(clouds, others)
     if len(numbers) < LEAST_PAIRS:
         return NO_OFFSET
-    found = registered(both, numbers)
-    if len(found.pairs) < LEAST_PAIRS or float(np.median(found.share)) < SHARED:
+    registration = registered(both, numbers)
+    if len(registration.pairs) < LEAST_PAIRS or float(np.median(registration.share)) < SHARED:
         return NO_OFFSET
-    shift = _searched(both, found)
+    shift = _searched(both, registration)
     if shift.any():
-        found = registered(both, numbers, _start(both, np.r_[shift, np.zeros(3)]))
-        if len(found.pairs) < LEAST_PAIRS:
+        registration = registered(both, numbers, _start(both, np.r_[shift, np.zeros(3)]))
+        if len(registration.pairs) < LEAST_PAIRS:
             return NO_OFFSET
-    offset, sigma = _offset(found, poses_at)
+    offset, sigma = _offset(registration, poses_at)
     for _ in range(MOST_STARTS):
         before = offset
         if not _is_sure(offset, sigma):
             break
-        found = registered(both, numbers, _start(both, offset))
-        if len(found.pairs) < LEAST_PAIRS:
+        registration = registered(both, numbers, _start(both, offset))
+        if len(registration.pairs) < LEAST_PAIRS:
             return NO_OFFSET
-        offset, sigma = _offset(found, poses_at)
+        offset, sigma = _offset(registration, poses_at)
         if (np.abs(offset - before) <= sigma).all():
             break
     known = np.where(np.abs(offset) >= LEAST_SIGMAS * sigma, offset, 0.0)
@@ -111,7 +111,7 @@ def offset_between(clouds: Clouds, others: Clouds, poses_at: PosesAt) -> Offset:
     )
 
 
-def _searched(both: Clouds, found: Registered) -> F64:
+def _searched(both: Clouds, registration: Registered) -> F64:
     """A shift (3,) of the second clouds on the level that far more across it shows; else zeros."""
     registrar = Registrar(both)
     distances = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * both.voxel
@@ -120,9 +120,9 @@ def _searched(both: Clouds, found: Registered) -> F64:
     for direction in np.eye(3)[:2]:
         shares = np.zeros(len(distances))
         usual = 1e-9
-        for row in evenly(len(found.pairs), TRIED).tolist():
-            target, source = found.numbers[row].tolist()
-            measured = found.pairs.measured[row]
+        for row in evenly(len(registration.pairs), TRIED).tolist():
+            target, source = registration.numbers[row].tolist()
+            measured = registration.pairs.measured[row]
             usual += float(registrar.shares_along(target, source, [measured], direction)[0])
             given = motion(both, target, source)
             tried = [given @ exp_se3(distance * direction, UNTURNED) for distance in distances]
@@ -160,16 +160,16 @@ def _pairs(clouds: Clouds, others: Clouds) -> tuple[Clouds, list[tuple[int, int]
     return both, pairs
 
 
-def _offset(found: Registered, poses_at: PosesAt) -> tuple[F64, F64]:
+def _offset(registration: Registered, poses_at: PosesAt) -> tuple[F64, F64]:
     """Translation (m) and rotation vector (rad) of the second clouds, (6,), and their deviations.
 
     The mean of the pairs, each weighted by its covariance; pairs far off count less and less.
     """
-    predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
-    offsets = -difference(found.pairs.measured, predicted)
+    predicted = pose_motion(registration.pairs, poses_at, np.zeros(PARAMETERS))
+    offsets = -difference(registration.pairs.measured, predicted)
     known = np.isfinite(offsets).all(1)
     offsets = offsets[known]
-    information = np.linalg.inv(found.pairs.covariance[known])
+    information = np.linalg.inv(registration.pairs.covariance[known])
     offset = np.median(offsets, axis=0)
     squares = np.zeros(len(offsets))
     hessian = information.sum(0)

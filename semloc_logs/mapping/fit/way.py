@@ -38,9 +38,14 @@ SLIPPED = 0.3, 1.8  # as far as by the poses, at least and at most, where odomet
 FAR_BETTER = 1.15  # times as many points lie on planes at such a distance
 
 
-def other_distance(clouds: Clouds, found: Registered) -> Start | None:
-    """Motions so many times as long as by the poses, where these fit far better than ``found``."""
-    ways = np.array([float(np.linalg.norm(_way(clouds, pair))) for pair in found.numbers.tolist()])
+def other_distance(clouds: Clouds, registration: Registered) -> Start | None:
+    """Motions so many times as long as by the poses, where these fit far better.
+
+    Than the ``registration`` from the poses.
+    """
+    ways = np.array(
+        [float(np.linalg.norm(_way(clouds, pair))) for pair in registration.numbers.tolist()]
+    )
     rows = np.flatnonzero(ways >= LEAST_WAY * clouds.voxel)
     if len(rows) < FEWEST:
         return None
@@ -52,12 +57,12 @@ def other_distance(clouds: Clouds, found: Registered) -> Start | None:
     shares = np.zeros(len(factors))
     found_share = 0.0
     for row in rows.tolist():
-        target, source = found.numbers[row].tolist()
+        target, source = registration.numbers[row].tolist()
         given = motion(clouds, target, source)
         direction = given[:3, 3] / ways[row]
         tried = [_lengthened(given, factor) for factor in factors]
         shares += registrar.shares_along(target, source, tried, direction)
-        measured = [found.pairs.measured[row]]
+        measured = [registration.pairs.measured[row]]
         found_share += float(registrar.shares_along(target, source, measured, direction)[0])
     best = int(np.argmax(shares)) if len(shares) else 0
     if not len(shares) or shares[best] <= max(BETTER * found_share, 1e-9):
@@ -65,17 +70,17 @@ def other_distance(clouds: Clouds, found: Registered) -> Start | None:
     return _start(clouds, float(factors[best]))
 
 
-def searched(clouds: Clouds, found: Registered) -> Registered:
+def searched(clouds: Clouds, registration: Registered) -> Registered:
     """The pairs, registered again where at another distance far more across the way fits.
 
     Odometry that slips for a while is wrong in a few pairs only. A pair is replaced where far more
     of its points lie on planes then.
     """
     registrar = Registrar(clouds)
-    measured = found.pairs.measured.copy()
-    covariance = found.pairs.covariance.copy()
-    share = found.share.copy()
-    for row, (target, source) in enumerate(found.numbers.tolist()):
+    measured = registration.pairs.measured.copy()
+    covariance = registration.pairs.covariance.copy()
+    share = registration.share.copy()
+    for row, (target, source) in enumerate(registration.numbers.tolist()):
         given = motion(clouds, target, source)
         way = float(np.linalg.norm(given[:3, 3]))
         if way < LEAST_WAY * clouds.voxel:
@@ -92,8 +97,8 @@ def searched(clouds: Clouds, found: Registered) -> Registered:
             measured[row] = fit.target_T_source
             covariance[row] = covariance_of(fit, clouds.voxel)
             share[row] = fit.share
-    pairs = Pairs(found.pairs.stamps_ns, measured, covariance)
-    return Registered(pairs, found.numbers, share, found.given_share)
+    pairs = Pairs(registration.pairs.stamps_ns, measured, covariance)
+    return Registered(pairs, registration.numbers, share, registration.given_share)
 
 
 def _way(clouds: Clouds, pair: list[int]) -> F64:

@@ -34,9 +34,13 @@ class Traffic:
         base_T_world = inverse(world_T_base)
         for parts, line, start, speed in self.vehicles:
             length = 0.5 * (len(line) - 1)
-            at = (start + speed * seconds) % length
+            distance = (start + speed * seconds) % length
             pose = poses_along(
-                line, np.array([at]), self.ground.slope_height, np.random.default_rng(0), shake=0.0
+                line,
+                np.array([distance]),
+                self.ground.slope_height,
+                np.random.default_rng(0),
+                shake=0.0,
             )[0]
             offset = (base_T_world @ pose)[:3, 3]
             # long vehicles keep off by what they are longer than a car
@@ -94,9 +98,9 @@ def pavement(ground: Ground, line: F64) -> F64:
     tangent = np.gradient(line, axis=0)
     right = -left_of(tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9))
     steps = np.arange(1.5, 9.0, 0.25)
-    at = line[:, None] + steps[:, None] * right[:, None]
-    off = (ground.beside[ground.cell(at[..., 0].ravel(), at[..., 1].ravel())] > 0.6).reshape(
-        at.shape[:2]
-    )
+    points = line[:, None] + steps[:, None] * right[:, None]
+    off = (
+        ground.beside[ground.cell(points[..., 0].ravel(), points[..., 1].ravel())] > 0.6
+    ).reshape(points.shape[:2])
     distance = np.where(off.any(1), steps[off.argmax(1)], 4.0)
     return np.asarray(line + gaussian_filter1d(distance, 6.0, mode="nearest")[:, None] * right)

@@ -44,21 +44,22 @@ def smooth_line(line: F64, sigma: float = 2.5) -> F64:
 
 def poses_along(
     line: F64,
-    at: F64,
+    distances: F64,
     height: Callable[[F64, F64], F64],
     rng: np.random.Generator,
     shake: float = 0.004,
 ) -> F64:
-    """``world_T_base`` (m, 4, 4) at arc lengths ``at`` (m,) of a smooth line: yaw from the tangent,
-    roll and pitch from ``height``.
+    """``world_T_base`` (m, 4, 4) at arc lengths ``distances`` (m,) of a smooth line.
+
+    Yaw is from the tangent, roll and pitch from ``height``.
     """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    position = np.column_stack([np.interp(at, along, line[:, k]) for k in (0, 1)])
+    position = np.column_stack([np.interp(distances, along, line[:, k]) for k in (0, 1)])
     ahead = np.column_stack(
-        [np.interp(np.minimum(at + 0.6, along[-1]), along, line[:, k]) for k in (0, 1)]
+        [np.interp(np.minimum(distances + 0.6, along[-1]), along, line[:, k]) for k in (0, 1)]
     )
     behind = np.column_stack(
-        [np.interp(np.maximum(at - 0.6, 0), along, line[:, k]) for k in (0, 1)]
+        [np.interp(np.maximum(distances - 0.6, 0), along, line[:, k]) for k in (0, 1)]
     )
     yaw = np.arctan2(*(ahead - behind).T[::-1])
     heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
@@ -66,8 +67,8 @@ def poses_along(
     z = height(*position.T)
     rise = _slope(height, position, heading)
     tilt = _slope(height, position, left)
-    noise = gaussian_filter1d(rng.normal(size=(len(at), 2)), 2.0, axis=0) * 2.5 * shake
-    out = np.tile(np.eye(4), (len(at), 1, 1))
+    noise = gaussian_filter1d(rng.normal(size=(len(distances), 2)), 2.0, axis=0) * 2.5 * shake
+    out = np.tile(np.eye(4), (len(distances), 1, 1))
     euler = np.column_stack([yaw, -np.arctan(rise) + noise[:, 0], np.arctan(tilt) + noise[:, 1]])
     out[:, :3, :3] = Rotation.from_euler("ZYX", euler).as_matrix()
     out[:, :2, 3], out[:, 2, 3] = position, z
@@ -105,9 +106,9 @@ def drive(
     )
     pace = gaussian_filter1d(pace, 8, mode="nearest")
     seconds = np.concatenate([[0.0], np.cumsum(np.diff(along) / pace[1:])])
-    at = np.arange(0.0, seconds[-1], 1.0 / POSES_HZ)
-    poses = poses_along(line, np.interp(at, seconds, along), height, rng)
-    stamps = start_ns + np.round(at * 1e9).astype(np.int64)
+    times = np.arange(0.0, seconds[-1], 1.0 / POSES_HZ)
+    poses = poses_along(line, np.interp(times, seconds, along), height, rng)
+    stamps = start_ns + np.round(times * 1e9).astype(np.int64)
     return Trajectory(stamps, poses, drifting_odometry(poses, rng, drift))
 
 

@@ -87,14 +87,16 @@ def inertial(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Gen
     force, rate, _ = motion(trajectory)
     stamps = trajectory.stamps_ns
     if sensors.imu_hz is not None:
-        at = np.arange(stamps[0], stamps[-1] + 1, round(1e9 / sensors.imu_hz), dtype=np.int64)
-        seconds = (at - stamps[0]) * 1e-9
+        stamps_ns = np.arange(
+            stamps[0], stamps[-1] + 1, round(1e9 / sensors.imu_hz), dtype=np.int64
+        )
+        seconds = (stamps_ns - stamps[0]) * 1e-9
         known = (stamps - stamps[0]) * 1e-9
         force, rate = (
             np.column_stack([np.interp(seconds, known, v[:, k]) for k in range(3)])
             for v in (force, rate)
         )
-        stamps = at
+        stamps = stamps_ns
     force = (
         force
         + rng.normal(size=3) * sensors.force_bias
@@ -113,15 +115,15 @@ def fixes(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Genera
     road.
     """
     stamps = trajectory.stamps_ns
-    at = np.arange(stamps[0], stamps[-1] + 1, round(1e9 / sensors.fix_hz), dtype=np.int64)
-    pose = interpolate(stamps, trajectory.world_T_base, at)
+    stamps_ns = np.arange(stamps[0], stamps[-1] + 1, round(1e9 / sensors.fix_hz), dtype=np.int64)
+    pose = interpolate(stamps, trajectory.world_T_base, stamps_ns)
     antenna = pose[:, :3, 3] + pose[:, :3, :3] @ ANTENNA
     slow = sensors.fix_seconds * sensors.fix_hz
     # white noise smoothed by a Gaussian of that width, brought back to a standard deviation of one;
     # padded, so that the ends are alike
     pad = int(4 * slow) + 1
-    wander = gaussian_filter1d(rng.normal(size=(len(at) + 2 * pad, 3)), slow, axis=0)[
-        pad : pad + len(at)
+    wander = gaussian_filter1d(rng.normal(size=(len(stamps_ns) + 2 * pad, 3)), slow, axis=0)[
+        pad : pad + len(stamps_ns)
     ] * np.sqrt(2 * np.sqrt(np.pi) * slow)
     error = (
         (0.95 * wander + 0.31 * rng.normal(size=wander.shape))
@@ -131,13 +133,13 @@ def fixes(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Genera
     way = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1))]
     )
-    status = np.zeros(len(at), np.int8)
+    status = np.zeros(len(stamps_ns), np.int8)
     begin = float(rng.exponential(1000.0 * sensors.outage_km))
     while begin < way[-1]:
         end = begin + float(rng.uniform(50.0, 200.0))
         status[(way >= begin) & (way < end)] = -1
         begin = end + float(rng.exponential(1000.0 * sensors.outage_km))
-    return Fixes(at, geodetic(antenna + error), status)
+    return Fixes(stamps_ns, geodetic(antenna + error), status)
 
 
 def geodetic(enu: F64, datum: tuple[float, float, float] = DATUM) -> F64:

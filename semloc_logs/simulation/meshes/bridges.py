@@ -63,17 +63,19 @@ def bridge(rng: Rng, half_span: float) -> Parts:
     )
     if half_span > 8 and rng.random() < 0.5:  # piers where the pavements are
         foot = cylinder(0.35, clear + 1, 10, z=-1.0)
-        at = [(x, y) for x in (-wide / 3, wide / 3) for y in (-half_span + 1.2, half_span - 1.2)]
-        parts.append((merge(*[place(foot, x, y) for x, y in at]), UNLABELLED))
+        corners = [
+            (x, y) for x in (-wide / 3, wide / 3) for y in (-half_span + 1.2, half_span - 1.2)
+        ]
+        parts.append((merge(*[place(foot, x, y) for x, y in corners]), UNLABELLED))
     parts.append((merge(*[_bank(s, half_span, wide, top) for s in (-1.0, 1.0)]), TERRAIN))
     return parts
 
 
-def _bank(sign: float, near: float, wide: float, top: float) -> Mesh:
+def _bank(sign: float, edge: float, wide: float, top: float) -> Mesh:
     """Slopes to both sides of the deck behind an abutment, and one that closes the end."""
     foot = wide / 2 + 1.4 * top
-    far = near + BANK
-    y0 = sign * (near + 1.0)
+    far = edge + BANK
+    y0 = sign * (edge + 1.0)
     y1 = sign * far
     y2 = sign * (far + 1.4 * top)
     plan = np.array(

@@ -58,9 +58,11 @@ def hedge(rng: Rng, path: F64, *, bare: bool = False) -> Parts:
     evergreen = own.random() < 0.5 and wild < 0.1
     length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     stems = int(np.clip(3 * length, 4, 400))
-    at = own.uniform(0, len(points) - 1, stems)
+    places = own.uniform(0, len(points) - 1, stems)
     up = height * own.uniform(0.6, 1.0 + wild, stems)
-    plan = np.column_stack([np.interp(at, np.arange(len(points)), points[:, k]) for k in (0, 1)])
+    plan = np.column_stack(
+        [np.interp(places, np.arange(len(points)), points[:, k]) for k in (0, 1)]
+    )
     ends = np.column_stack([plan + own.normal(size=(stems, 2)) * 0.25 * width, up])
     wood = tubes(np.column_stack([plan, np.full(stems, -0.1)]), ends, 0.025, 0.01, 3)
     seed = np.random.default_rng(int(own.integers(2**62)))
@@ -87,8 +89,10 @@ def _hedge_leaves(
     core.vertices[:, :2] += rng.normal(size=(len(core.vertices), 2)) * wild * 0.5
     core.vertices[:, 2] *= 1 + rng.normal(size=len(core.vertices)) * wild * 0.4
     count = int(min(length * (2 * height + width) * (12 + 30 * wild), 4000))
-    at = rng.uniform(0, len(points) - 1, count)
-    plan = np.column_stack([np.interp(at, np.arange(len(points)), points[:, k]) for k in (0, 1)])
+    places = rng.uniform(0, len(points) - 1, count)
+    plan = np.column_stack(
+        [np.interp(places, np.arange(len(points)), points[:, k]) for k in (0, 1)]
+    )
     centre = np.column_stack(
         [
             plan + rng.normal(size=(count, 2)) * (0.42 * width),

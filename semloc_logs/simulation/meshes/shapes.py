@@ -134,8 +134,8 @@ def wheels(
 def resample(path: F64, spacing: float) -> F64:
     """The plan path (n, 2) with points every ``spacing`` metres, ends kept."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / spacing)) + 1))
-    return np.column_stack([np.interp(at, along, path[:, k]) for k in range(path.shape[1])])
+    distances = np.linspace(0, along[-1], max(2, int(np.ceil(along[-1] / spacing)) + 1))
+    return np.column_stack([np.interp(distances, along, path[:, k]) for k in range(path.shape[1])])
 
 
 def snow_cover(parts: Parts, depth: float, steepest: float = 0.6) -> Parts:

@@ -45,8 +45,8 @@ class Lap:
             )
         )
         count = int(length_m / _SPACING)
-        at = 30.0 + _SPACING / _POSES * np.arange(count * _POSES + 1, dtype=np.float64)
-        self.poses = poses_along(line, at, street_ground(network, seed).slope_height, rng)
+        distances = 30.0 + _SPACING / _POSES * np.arange(count * _POSES + 1, dtype=np.float64)
+        self.poses = poses_along(line, distances, street_ground(network, seed).slope_height, rng)
         self.base_T_lidar = mounting(MODELS["hdl32"])
         scene = Scene(build_street(network, seed))
         self.sweeps = []

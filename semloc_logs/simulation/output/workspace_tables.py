@@ -261,11 +261,11 @@ def _results(
             if not earlier or len(closures) == plan.closures:
                 continue
             target = drives[int(rng.choice(earlier))]
-            near = _nearest(target, drives[q].places[k])
-            if near is None or (q, k, target.name) in closed:
+            nearest = _nearest(target, drives[q].places[k])
+            if nearest is None or (q, k, target.name) in closed:
                 continue
             closed |= {(q, k, target.name), (q, k)}
-            closures.append(_closure(drives[q], int(k), target, near, rng))
+            closures.append(_closure(drives[q], int(k), target, nearest, rng))
         if len(closures) == before:
             break
     for q, k in queries:
@@ -287,22 +287,24 @@ def _nearest(target: _Drive, place: F64) -> int | None:
     return nearest if off[nearest] < 6 else None
 
 
-def _closure(query: _Drive, k: int, target: _Drive, near: int, rng: np.random.Generator) -> Closure:
+def _closure(
+    query: _Drive, k: int, target: _Drive, nearest: int, rng: np.random.Generator
+) -> Closure:
     noise = exp_se3(rng.normal(0, SIGMA[0], 3), rng.normal(0, SIGMA[1], 3))
-    pose = inverse(target.world_T_base[near]) @ query.world_T_base[k] @ noise
+    pose = inverse(target.world_T_base[nearest]) @ query.world_T_base[k] @ noise
     probability = float(1 - 10 ** -rng.uniform(2, 5))
     features = Features(*map(float, (rng.uniform(0.6, 0.98), 0.9, 0.03, 0.7, 3.6, 2.2, 0.0)))
-    alignment = _alignment((query, k), (target, near), pose, features, rng)
+    alignment = _alignment((query, k), (target, nearest), pose, features, rng)
     return Closure(alignment, _decision(probability, rng))
 
 
 def _rejected(query: _Drive, k: int, target: _Drive, rng: np.random.Generator) -> Rejected:
-    near = int(rng.integers(len(target.places)))
+    nearest = int(rng.integers(len(target.places)))
     features = Features(
         *map(float, (rng.uniform(0.1, 0.6), 0.5, 0.2, 0.3, 2.1, rng.uniform(0, 2), 0.0))
     )
     probability = float(rng.uniform(0, 0.6))
-    alignment = _alignment((query, k), (target, near), np.eye(4), features, rng)
+    alignment = _alignment((query, k), (target, nearest), np.eye(4), features, rng)
     reasons = (Reason.FREE_SPACE, Reason.RIVAL_PLACE, Reason.AMBIGUOUS_PLACE)
     reason = reasons[int(rng.integers(len(reasons)))]
     return Rejected(alignment, _decision(probability, rng), reason)

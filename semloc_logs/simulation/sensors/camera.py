@@ -339,11 +339,11 @@ def _bleed(
     reach = (0.5 + 0.25 * _patches(rng, depth.shape)) * pixels + 0.5
     for k in range(rounds):
         for axis, shift in ((1, 1), (1, -1), (0, 1)):
-            near = np.roll(depth, shift, axis)
-            taken = (near < 0.93 * depth - 0.1) & (reach > k + 1) & np.isfinite(near)
+            neighbour = np.roll(depth, shift, axis)
+            taken = (neighbour < 0.93 * depth - 0.1) & (reach > k + 1) & np.isfinite(neighbour)
             taken[:, 0 if shift > 0 else -1] = False
             taken[0] = False
-            depth = np.where(taken, near, depth)
+            depth = np.where(taken, neighbour, depth)
             labels = np.where(taken, np.roll(labels, shift, axis), labels)
             holes = np.where(taken, np.roll(holes, shift, axis), holes)
     return depth, labels, holes

@@ -112,16 +112,16 @@ def mixed_ranges(rng: np.random.Generator, distance: F32, gap: float, divergence
     """
     out = distance.copy()
     cut = min(1.0, divergence / gap)
-    near = np.minimum(distance[:-1], distance[1:])
+    nearer = np.minimum(distance[:-1], distance[1:])
     far = np.maximum(distance[:-1], distance[1:])
     with np.errstate(invalid="ignore"):
-        step = np.where(np.isfinite(far), far - near, 0.0)
-    is_edge = step > np.maximum(0.15, 0.02 * near)
+        step = np.where(np.isfinite(far), far - nearer, 0.0)
+    is_edge = step > np.maximum(0.15, 0.02 * nearer)
     i, j = np.nonzero(
         is_edge & (rng.random(step.shape, np.float32) < cut * _PULSE / (_PULSE + step))
     )
     which = i + (rng.random(len(i)) < 0.5)
-    out[which, j] = near[i, j] + rng.random(len(i)) * step[i, j]
+    out[which, j] = nearer[i, j] + rng.random(len(i)) * step[i, j]
     return out
 
 

@@ -65,11 +65,11 @@ def corrupt_labels(
     out = labels.copy()
     exact = np.asarray(points, np.float64)
     if beyond is not None:
-        at = np.flatnonzero(beyond != labels)
+        rows = np.flatnonzero(beyond != labels)
         patch = hash_cells(
-            np.floor(exact[at] / 0.7).astype(np.int64), seed * 3 + 7 + 65_537 * (frame or 0)
+            np.floor(exact[rows] / 0.7).astype(np.int64), seed * 3 + 7 + 65_537 * (frame or 0)
         )
-        bleeds = at[patch % 4096 < 4096 * min(1.0, _BLEED * rate / 0.15)]
+        bleeds = rows[patch % 4096 < 4096 * min(1.0, _BLEED * rate / 0.15)]
         out[bleeds] = beyond[bleeds]
         rate = max(0.0, rate - len(bleeds) / max(1, len(labels)))
     passing = 0 if frame is None else 1_000_003 * (frame + 1)

@@ -88,19 +88,19 @@ class Painter:
         place = world_T_camera[:3, 3].astype(np.float32)
         out = np.zeros((hits.depth.size, 3), np.float32)
         seen = np.isfinite(hits.depth).ravel()
-        at = np.flatnonzero(seen)
+        rows = np.flatnonzero(seen)
         open_ = np.flatnonzero(~seen)
         out[open_] = self._sky(rays.reshape(-1, 3)[open_] @ turn.T)
-        ray = rays.reshape(-1, 3)[at]
-        depth = hits.depth.ravel()[at]
+        ray = rays.reshape(-1, 3)[rows]
+        depth = hits.depth.ravel()[rows]
         ray = ray @ turn.T
         points = ray * depth[:, None] + place
-        normals = hits.normal.reshape(-1, 3)[at].astype(np.float32)
+        normals = hits.normal.reshape(-1, 3)[rows].astype(np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         facing = np.einsum("ij,ij->i", normals, ray)
         footprint = np.asarray(depth / model.focal / np.clip(np.abs(facing), 0.12, 1), np.float32)
-        colour, gloss = self._colours(hits, at, points, normals, footprint, traffic)
+        colour, gloss = self._colours(hits, rows, points, normals, footprint, traffic)
         normals *= np.where(facing > 0, np.float32(-1), np.float32(1))[:, None]
         lit = self._lit(points, normals, traffic) * colour
         some = np.flatnonzero(gloss > 0)
@@ -108,7 +108,7 @@ class Painter:
         shine = (gloss[some] * (0.25 + 0.75 * (1 - np.abs(facing[some])) ** 3))[:, None]
         lit[some] += shine * (0.8 * self._sky(mirrored) - lit[some])
         haze = (1 - np.exp(-depth / _HAZE))[:, None]
-        out[at] = lit + haze * (np.asarray(self.light.horizon, np.float32) - lit)
+        out[rows] = lit + haze * (np.asarray(self.light.horizon, np.float32) - lit)
         return out.reshape(*rays.shape)
 
     def _colours(
@@ -135,8 +135,8 @@ class Painter:
         if traffic is not None and moving.any():
             groups.append((moving, surfaces(traffic.world, moving=True)))
         for mask, known in groups:
-            at = seen.take(mask).spots(known)
-            colour[mask], gloss[mask] = colours(at, self.condition.season)
+            spots = seen.take(mask).spots(known)
+            colour[mask], gloss[mask] = colours(spots, self.condition.season)
         return colour, gloss
 
     def _lit(self, points: F32, normals: F32, traffic: Scene | None) -> F32:

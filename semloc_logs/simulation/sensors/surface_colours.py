@@ -110,8 +110,8 @@ def markings(plan: RoadPlan, points: F32, footprint: F32) -> F32:
     """How much of a painted line (0 to 1) lies at points (n, 3): along the kerb, and dashed in the
     middle; ``footprint`` (n,) in metres.
     """
-    at = (points[:, :2] - plan.corner) / plan.cell - 0.5
-    columns, rows = (np.ascontiguousarray(at[:, k], np.float32)[None] for k in (0, 1))
+    cells = (points[:, :2] - plan.corner) / plan.cell - 0.5
+    columns, rows = (np.ascontiguousarray(cells[:, k], np.float32)[None] for k in (0, 1))
     beside = cv2_remap(plan.beside, columns, rows)
     half = cv2_remap(plan.half_width, columns, rows)
     soft = np.maximum(footprint, 0.02)

@@ -121,15 +121,15 @@ class Pixels:
         )
 
 
-def colours(at: Spots, season: str) -> tuple[F32, F32]:
+def colours(spots: Spots, season: str) -> tuple[F32, F32]:
     """Reflectances (n, 3) and how much is mirrored (n,), both from 0 to 1."""
-    colour = np.zeros((len(at.points), 3), np.float32)
-    gloss = np.zeros(len(at.points), np.float32)
-    for label in np.unique(at.labels).tolist():
-        some = np.flatnonzero(at.labels == label)
-        colour[some], gloss[some] = _PAINTERS.get(label, _thing)(at.take(some), season)
+    colour = np.zeros((len(spots.points), 3), np.float32)
+    gloss = np.zeros(len(spots.points), np.float32)
+    for label in np.unique(spots.labels).tolist():
+        some = np.flatnonzero(spots.labels == label)
+        colour[some], gloss[some] = _PAINTERS.get(label, _thing)(spots.take(some), season)
     if season == "snow":
-        _snow(at, colour, gloss)
+        _snow(spots, colour, gloss)
     return np.maximum(colour, np.float32(0)), gloss
 
 
@@ -153,11 +153,11 @@ def _painted(seed: I64, salt: I64 | int) -> F32:
     return np.where((draw[0] < 0.55)[:, None], _rgb(grey, grey, grey), bright)
 
 
-def _wall(at: Spots, u: F32, h: F32) -> F32:
+def _wall(spots: Spots, u: F32, h: F32) -> F32:
     """Brick, plaster or panels, with dirt and graffiti."""
-    seed = at.seed
-    f = at.footprint
-    rough = at.noise(1.7, 7, 0.85)
+    seed = spots.seed
+    f = spots.footprint
+    rough = spots.noise(1.7, 7, 0.85)
     style = number(seed, 1, 7)
     warm = number(seed, 2, 7)
     joint, tone = stones(u, h, Stone(0.24, 0.083, 0.014), f, seed)
@@ -179,7 +179,7 @@ def _wall(at: Spots, u: F32, h: F32) -> F32:
     wall = np.where(
         (style < 0.35)[:, None], brick, np.where((style < 0.8)[:, None], plaster, panel)
     )
-    streak = np.maximum(at.noise(0.7, 1, 1.0, stretch=0.1, seed=5), 0)
+    streak = np.maximum(spots.noise(0.7, 1, 1.0, stretch=0.1, seed=5), 0)
     wall = _tone(wall, 1 - 0.35 * np.clip(1 - h / 0.8, 0, 1) - 0.1 * streak)
     i = cell(u, 1.7)
     j = cell(h, 1.1)
@@ -187,13 +187,15 @@ def _wall(at: Spots, u: F32, h: F32) -> F32:
     return _mix(wall, _painted(seed, i), sprayed * letters(u, h, 0.09, f, seed))
 
 
-def _facade(at: Spots) -> tuple[F32, F32]:
+def _facade(spots: Spots) -> tuple[F32, F32]:
     """A wall of a house with its windows and doors."""
-    seed = at.seed
-    f = at.footprint
-    u = at.along()
-    h = at.points[:, 2] - at.low[:, 2] - np.float32(1.5)  # houses reach that far into the ground
-    wall = _wall(at, u, h)
+    seed = spots.seed
+    f = spots.footprint
+    u = spots.along()
+    h = (
+        spots.points[:, 2] - spots.low[:, 2] - np.float32(1.5)
+    )  # houses reach that far into the ground
+    wall = _wall(spots, u, h)
     storey = 2.6 + 0.6 * number(seed, 6, 7)
     pitch = 1.7 + 1.9 * number(seed, 7, 7)
     i = cell(u, pitch)
@@ -237,14 +239,16 @@ def _facade(at: Spots) -> tuple[F32, F32]:
     return _mix(colour, inside, pane), np.asarray(0.55 * pane, np.float32)
 
 
-def _roof(at: Spots) -> F32:
+def _roof(spots: Spots) -> F32:
     """Tiles, or gravel where it is flat."""
-    rough = at.noise(1.5, 7, 0.85, seed=13)
-    up = np.abs(at.normals[:, 2])
+    rough = spots.noise(1.5, 7, 0.85, seed=13)
+    up = np.abs(spots.normals[:, 2])
     slope = np.sqrt(np.maximum(1 - up**2, 0.05))
     tiling = Stone(0.22, 0.34, 0.03)
-    joint, tone = stones(at.along(), at.points[:, 2] / slope, tiling, at.footprint, at.seed)
-    kind = number(at.seed, 12, 7)[:, None]
+    joint, tone = stones(
+        spots.along(), spots.points[:, 2] / slope, tiling, spots.footprint, spots.seed
+    )
+    kind = number(spots.seed, 12, 7)[:, None]
     tile = np.where(
         kind < 0.5,
         _rgb(0.30, 0.11, 0.07),
@@ -254,24 +258,24 @@ def _roof(at: Spots) -> F32:
     return np.where((up > 0.97)[:, None], _tone(_rgb(0.22, 0.21, 0.2), 1 + 0.35 * rough), tiles)
 
 
-def _building(at: Spots, season: str) -> tuple[F32, F32]:
-    colour = np.zeros((len(at.points), 3), np.float32)
-    gloss = np.zeros(len(at.points), np.float32)
-    is_wall = np.abs(at.normals[:, 2]) < 0.25
+def _building(spots: Spots, season: str) -> tuple[F32, F32]:
+    colour = np.zeros((len(spots.points), 3), np.float32)
+    gloss = np.zeros(len(spots.points), np.float32)
+    is_wall = np.abs(spots.normals[:, 2]) < 0.25
     walls = np.flatnonzero(is_wall)
     roofs = np.flatnonzero(~is_wall)
-    colour[walls], gloss[walls] = _facade(at.take(walls))
-    colour[roofs] = _roof(at.take(roofs))
+    colour[walls], gloss[walls] = _facade(spots.take(walls))
+    colour[roofs] = _roof(spots.take(roofs))
     return colour, gloss
 
 
-def _road(at: Spots, season: str) -> tuple[F32, F32]:
+def _road(spots: Spots, season: str) -> tuple[F32, F32]:
     """Asphalt with mended patches, cracks, covers and worn markings."""
-    x = at.points[:, 0]
-    y = at.points[:, 1]
-    f = at.footprint
-    grain = at.noise(0.35, 6, 0.9, stretch=0.0, seed=17)
-    lines = at.noise(1.6, 4, 0.6, stretch=0.0, seed=29)
+    x = spots.points[:, 0]
+    y = spots.points[:, 1]
+    f = spots.footprint
+    grain = spots.noise(0.35, 6, 0.9, stretch=0.0, seed=17)
+    lines = spots.noise(1.6, 4, 0.6, stretch=0.0, seed=29)
     tone = 1 + 0.32 * grain + 0.1 * lines
     i = cell(x, 4.7)
     j = cell(y, 3.9)
@@ -299,45 +303,47 @@ def _road(at: Spots, season: str) -> tuple[F32, F32]:
     colour = _mix(colour, _tone(_rgb(0.1, 0.085, 0.07), 0.6 + 0.9 * grid), cover)
     colour = _tone(colour, 1 - 0.6 * (mend > 0.955) * within(r, 0.35, 0.4, f))
     return _mix(
-        colour, _rgb(0.62, 0.62, 0.6), at.paint * (0.85 - 0.35 * np.maximum(grain, 0))
+        colour, _rgb(0.62, 0.62, 0.6), spots.paint * (0.85 - 0.35 * np.maximum(grain, 0))
     ), np.zeros(len(x), np.float32)
 
 
-def _sidewalk(at: Spots, season: str) -> tuple[F32, F32]:
-    x = at.points[:, 0]
-    y = at.points[:, 1]
-    joint, tone = stones(x + 0.13 * y, y - 0.13 * x, Stone(0.6, 0.4, 0.015), at.footprint, 67)
-    colour = _tone(_rgb(0.3, 0.29, 0.27), 1 + 0.16 * tone + 0.22 * at.noise(0.9, 7, 0.85, seed=71))
+def _sidewalk(spots: Spots, season: str) -> tuple[F32, F32]:
+    x = spots.points[:, 0]
+    y = spots.points[:, 1]
+    joint, tone = stones(x + 0.13 * y, y - 0.13 * x, Stone(0.6, 0.4, 0.015), spots.footprint, 67)
+    colour = _tone(
+        _rgb(0.3, 0.29, 0.27), 1 + 0.16 * tone + 0.22 * spots.noise(0.9, 7, 0.85, seed=71)
+    )
     return _mix(colour, _rgb(0.1, 0.1, 0.09), 0.6 * joint), np.zeros(len(x), np.float32)
 
 
-def _terrain(at: Spots, season: str) -> tuple[F32, F32]:
-    bare = np.clip(0.5 + 1.2 * at.noise(5.0, 4, 0.6, stretch=0.0, seed=73), 0, 1)
+def _terrain(spots: Spots, season: str) -> tuple[F32, F32]:
+    bare = np.clip(0.5 + 1.2 * spots.noise(5.0, 4, 0.6, stretch=0.0, seed=73), 0, 1)
     grass = _mix(_rgb(0.2, 0.16, 0.09), _rgb(0.09, 0.16, 0.04), 0.25 + 0.75 * bare)
-    grass = _tone(grass, 1 + 0.38 * at.noise(0.5, 6, 0.9, seed=79))
+    grass = _tone(grass, 1 + 0.38 * spots.noise(0.5, 6, 0.9, seed=79))
     if season == "autumn":
-        fallen = (number(cell(at.points[:, 0], 0.12), cell(at.points[:, 1], 0.12), 83) < 0.16) & (
-            at.footprint < 0.2
-        )
+        fallen = (
+            number(cell(spots.points[:, 0], 0.12), cell(spots.points[:, 1], 0.12), 83) < 0.16
+        ) & (spots.footprint < 0.2)
         grass = np.where(fallen[:, None], _rgb(0.4, 0.22, 0.04), grass)
     return grass, np.zeros(len(grass), np.float32)
 
 
-def _plant(at: Spots, season: str) -> tuple[F32, F32]:
-    kind = number(at.seed, 1, 43)
-    leaf = number(at.own, 2, 43)
+def _plant(spots: Spots, season: str) -> tuple[F32, F32]:
+    kind = number(spots.seed, 1, 43)
+    leaf = number(spots.own, 2, 43)
     green = _mix(_rgb(0.07, 0.15, 0.03), _rgb(0.16, 0.2, 0.05), kind)
     if season == "autumn":
-        turned = _mix(_rgb(0.42, 0.24, 0.03), _rgb(0.35, 0.08, 0.03), number(at.seed, 3, 43))
+        turned = _mix(_rgb(0.42, 0.24, 0.03), _rgb(0.35, 0.08, 0.03), number(spots.seed, 3, 43))
         green = np.where(
             (kind < 0.8)[:, None], _mix(turned, _rgb(0.2, 0.2, 0.05), 0.6 * leaf), green
         )
     elif season in ("winter", "snow"):
         green = _mix(green, _rgb(0.12, 0.1, 0.06), np.full(len(kind), 0.5))
-    colour = _tone(green, 0.55 + 0.9 * leaf + 0.35 * at.noise(0.3, 5, 0.85, seed=47))
-    some = np.flatnonzero(at.bark)
+    colour = _tone(green, 0.55 + 0.9 * leaf + 0.35 * spots.noise(0.3, 5, 0.85, seed=47))
+    some = np.flatnonzero(spots.bark)
     if len(some):
-        stem = at.take(some)
+        stem = spots.take(some)
         ridges = 0.4 * stem.noise(0.12, 3, 0.8, stretch=0.25, seed=37) + 0.25 * stem.noise(
             0.6, 4, 0.8, seed=41
         )
@@ -345,59 +351,59 @@ def _plant(at: Spots, season: str) -> tuple[F32, F32]:
     return colour, np.zeros(len(colour), np.float32)
 
 
-def _vehicle(at: Spots, season: str) -> tuple[F32, F32]:
+def _vehicle(spots: Spots, season: str) -> tuple[F32, F32]:
     """Paint, panes and tyres by height; nothing that stays in place while the vehicle drives."""
-    size = at.high[:, 2] - at.low[:, 2]
-    share = (at.points[:, 2] - at.low[:, 2]) / np.maximum(size, 0.1)
-    up = np.abs(at.normals[:, 2])
-    is_car = (at.labels == CAR) & (size < 2.1)
-    glazed = (at.labels != TRUCK) & (up < 0.5) & (share > 0.52) & (share < 0.8)
+    size = spots.high[:, 2] - spots.low[:, 2]
+    share = (spots.points[:, 2] - spots.low[:, 2]) / np.maximum(size, 0.1)
+    up = np.abs(spots.normals[:, 2])
+    is_car = (spots.labels == CAR) & (size < 2.1)
+    glazed = (spots.labels != TRUCK) & (up < 0.5) & (share > 0.52) & (share < 0.8)
     pane = np.where(is_car, (up < 0.8) & (share > 0.58) & (share < 0.92), glazed)
     tyre = ~pane & (share < np.where(is_car, 0.24, 0.16))
-    colour = np.where(pane[:, None], _rgb(0.03, 0.035, 0.04), _painted(at.seed, 51))
+    colour = np.where(pane[:, None], _rgb(0.03, 0.035, 0.04), _painted(spots.seed, 51))
     gloss = np.where(pane, np.float32(0.6), np.float32(0.12)) * ~tyre
     return np.where(tyre[:, None], _rgb(0.025, 0.025, 0.025), colour), np.asarray(gloss, np.float32)
 
 
-def _masonry(at: Spots, season: str) -> tuple[F32, F32]:
+def _masonry(spots: Spots, season: str) -> tuple[F32, F32]:
     joint, tone = stones(
-        at.along(), at.points[:, 2], Stone(0.37, 0.19, 0.02), at.footprint, at.seed
+        spots.along(), spots.points[:, 2], Stone(0.37, 0.19, 0.02), spots.footprint, spots.seed
     )
-    stone = _mix(_rgb(0.33, 0.3, 0.25), _rgb(0.36, 0.2, 0.14), number(at.seed, 1, 57))
-    colour = _tone(stone, 1 + 0.4 * tone + 0.22 * at.noise(0.8, 6, 0.85, seed=53))
+    stone = _mix(_rgb(0.33, 0.3, 0.25), _rgb(0.36, 0.2, 0.14), number(spots.seed, 1, 57))
+    colour = _tone(stone, 1 + 0.4 * tone + 0.22 * spots.noise(0.8, 6, 0.85, seed=53))
     return _mix(colour, _rgb(0.3, 0.29, 0.27), 0.7 * joint), np.zeros(len(colour), np.float32)
 
 
-def _fence(at: Spots, season: str) -> tuple[F32, F32]:
-    wood = _mix(_rgb(0.24, 0.16, 0.09), _rgb(0.45, 0.45, 0.43), number(at.seed, 2, 57))
-    grain = at.noise(0.8, 6, 0.85, seed=53) + at.noise(0.06, 2, 0.8, stretch=0.08, seed=59)
+def _fence(spots: Spots, season: str) -> tuple[F32, F32]:
+    wood = _mix(_rgb(0.24, 0.16, 0.09), _rgb(0.45, 0.45, 0.43), number(spots.seed, 2, 57))
+    grain = spots.noise(0.8, 6, 0.85, seed=53) + spots.noise(0.06, 2, 0.8, stretch=0.08, seed=59)
     return _tone(wood, 1 + 0.25 * grain), np.zeros(len(wood), np.float32)
 
 
-def _pole(at: Spots, season: str) -> tuple[F32, F32]:
-    x, y, z = at.points.T
-    metal = _mix(_rgb(0.2, 0.21, 0.21), _rgb(0.05, 0.08, 0.06), number(at.seed, 4, 57))
-    metal = _tone(metal, 1 + 0.2 * at.noise(0.8, 6, 0.85, seed=53))
+def _pole(spots: Spots, season: str) -> tuple[F32, F32]:
+    x, y, z = spots.points.T
+    metal = _mix(_rgb(0.2, 0.21, 0.21), _rgb(0.05, 0.08, 0.06), number(spots.seed, 4, 57))
+    metal = _tone(metal, 1 + 0.2 * spots.noise(0.8, 6, 0.85, seed=53))
     row = cell(z, 0.23)
-    h = z - at.low[:, 2]
-    stuck = (number(row, at.seed, 58) < 0.22) & (h > 0.5) & (h < 2.2)
+    h = z - spots.low[:, 2]
+    stuck = (number(row, spots.seed, 58) < 0.22) & (h > 0.5) & (h < 2.2)
     note = _mix(
-        _painted(at.seed, row),
+        _painted(spots.seed, row),
         _rgb(0.6, 0.6, 0.6),
-        letters(x + 1.3 * y, z, 0.035, at.footprint, at.seed),
+        letters(x + 1.3 * y, z, 0.035, spots.footprint, spots.seed),
     )
     return np.where(stuck[:, None], note, metal), np.zeros(len(x), np.float32)
 
 
-def _sign(at: Spots, season: str) -> tuple[F32, F32]:
+def _sign(spots: Spots, season: str) -> tuple[F32, F32]:
     """A face with a rim and something written on it."""
-    offset = at.points - (at.low + at.high) / 2
-    f = at.footprint
-    r = np.linalg.norm(offset, axis=1) / np.maximum(0.5 * (at.high - at.low)[:, 2], 0.1)
-    kind = number(at.seed, 5, 57)[:, None]
+    offset = spots.points - (spots.low + spots.high) / 2
+    f = spots.footprint
+    r = np.linalg.norm(offset, axis=1) / np.maximum(0.5 * (spots.high - spots.low)[:, 2], 0.1)
+    kind = number(spots.seed, 5, 57)[:, None]
     rim = np.where(kind < 0.6, _rgb(0.5, 0.02, 0.02), _rgb(0.02, 0.08, 0.4))
     face = np.where(kind < 0.75, _rgb(0.65, 0.65, 0.65), _rgb(0.6, 0.45, 0.03))
-    ink = letters(offset[:, 0] + 1.3 * offset[:, 1], offset[:, 2], 0.09, f, at.seed) * within(
+    ink = letters(offset[:, 0] + 1.3 * offset[:, 1], offset[:, 2], 0.09, f, spots.seed) * within(
         r, -1.0, 0.62, f
     )
     return _mix(_mix(face, rim, within(r, 0.72, 99.0, f)), _rgb(0.02, 0.02, 0.02), ink), np.zeros(
@@ -405,32 +411,34 @@ def _sign(at: Spots, season: str) -> tuple[F32, F32]:
     )
 
 
-def _person(at: Spots, season: str) -> tuple[F32, F32]:
-    share = (at.points[:, 2] - at.low[:, 2]) / np.maximum(at.high[:, 2] - at.low[:, 2], 0.5)
-    skin = _mix(_rgb(0.4, 0.25, 0.18), _rgb(0.1, 0.06, 0.04), number(at.seed, 6, 57))
-    cloth = np.where((share > 0.48)[:, None], _painted(at.seed, 61), _painted(at.seed, 62))
+def _person(spots: Spots, season: str) -> tuple[F32, F32]:
+    share = (spots.points[:, 2] - spots.low[:, 2]) / np.maximum(
+        spots.high[:, 2] - spots.low[:, 2], 0.5
+    )
+    skin = _mix(_rgb(0.4, 0.25, 0.18), _rgb(0.1, 0.06, 0.04), number(spots.seed, 6, 57))
+    cloth = np.where((share > 0.48)[:, None], _painted(spots.seed, 61), _painted(spots.seed, 62))
     return np.where((share > 0.87)[:, None], skin, cloth), np.zeros(len(share), np.float32)
 
 
-def _lamp(at: Spots, season: str) -> tuple[F32, F32]:
-    return np.tile(_rgb(0.03, 0.03, 0.03), (len(at.points), 1)), np.full(
-        len(at.points), 0.1, np.float32
+def _lamp(spots: Spots, season: str) -> tuple[F32, F32]:
+    return np.tile(_rgb(0.03, 0.03, 0.03), (len(spots.points), 1)), np.full(
+        len(spots.points), 0.1, np.float32
     )
 
 
-def _thing(at: Spots, season: str) -> tuple[F32, F32]:
+def _thing(spots: Spots, season: str) -> tuple[F32, F32]:
     """A box, a bin, a bicycle: painted, some of it written on."""
-    colour = _tone(_painted(at.seed, 63), 1 + 0.25 * at.noise(0.8, 6, 0.85, seed=53))
-    written = (at.labels == UNLABELLED) & (number(at.seed, 7, 57) < 0.4)
-    ink = written * letters(at.along(), at.points[:, 2], 0.07, at.footprint, at.seed)
+    colour = _tone(_painted(spots.seed, 63), 1 + 0.25 * spots.noise(0.8, 6, 0.85, seed=53))
+    written = (spots.labels == UNLABELLED) & (number(spots.seed, 7, 57) < 0.4)
+    ink = written * letters(spots.along(), spots.points[:, 2], 0.07, spots.footprint, spots.seed)
     return _mix(colour, _rgb(0.6, 0.58, 0.5), 0.7 * ink), np.zeros(len(colour), np.float32)
 
 
-def _snow(at: Spots, colour: F32, gloss: F32) -> None:
+def _snow(spots: Spots, colour: F32, gloss: F32) -> None:
     """White on surfaces that are not steep; roads are driven away and salted."""
-    up = np.abs(at.normals[:, 2])
-    some = np.flatnonzero((up > 0.35) & ((at.labels < PERSON) | (at.labels > MOTORCYCLE)))
-    lying = at.take(some)
+    up = np.abs(spots.normals[:, 2])
+    some = np.flatnonzero((up > 0.35) & ((spots.labels < PERSON) | (spots.labels > MOTORCYCLE)))
+    lying = spots.take(some)
     road = lying.noise(2.5, 5, 0.7, stretch=0.0, seed=97)
     cover = np.where(
         lying.labels == ROAD, 1.6 * road - 0.2, 0.9 + 0.7 * lying.noise(2.5, 4, 0.6, seed=89)

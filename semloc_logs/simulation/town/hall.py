@@ -97,13 +97,13 @@ def _shell(builder: MeshBuilder, plan: _Plan, rng: np.random.Generator) -> None:
             u += piece
     for _ in range(int(rng.integers(2, 9))):
         along = rng.random() < 0.5
-        at = rng.uniform(1, min(w, d) - 1)
+        offset = rng.uniform(1, min(w, d) - 1)
         z = plan.height - rng.uniform(0.2, 0.6)
         size = rng.uniform(0.1, 0.6)
         pipe = (
-            box(w, size, size, w / 2, at, z - size)
+            box(w, size, size, w / 2, offset, z - size)
             if along
-            else box(size, d, size, at, d / 2, z - size)
+            else box(size, d, size, offset, d / 2, z - size)
         )
         builder.add(pipe, BUILDING, ground="none")
 

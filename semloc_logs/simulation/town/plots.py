@@ -259,10 +259,10 @@ def _garden(row: _Row, u: float, width: float, behind: float, house: bool) -> No
     walk = row.walk
     rng = setting.rng
     for _ in range(rng.poisson(style.garden * width / 4)):
-        near = rng.random() < (0.5 if house else 0.7)
+        has_hedge = rng.random() < (0.5 if house else 0.7)
         v = (
             rng.uniform(walk + 0.8, max(walk + 1.0, walk + style.setback))
-            if near
+            if has_hedge
             else behind + rng.uniform(1, 22)
         )
         x, y, _ = side.at(u + rng.uniform(0, width), v)
@@ -270,7 +270,7 @@ def _garden(row: _Row, u: float, width: float, behind: float, house: bool) -> No
             np.array([[x, y], [x + 0.6, y], [x - 0.6, y], [x, y + 0.6], [x, y - 0.6]])
         ):
             continue
-        if rng.random() < (0.2 if near else 0.5):
+        if rng.random() < (0.2 if has_hedge else 0.5):
             setting.put_tree(x, y, rng.uniform(0.3, 1.1))
         elif rng.random() < 0.8:
             setting.put(objects.bush(rng, bare=setting.condition.bare), x, y, rng.uniform(0, 6.3))

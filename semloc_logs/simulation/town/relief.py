@@ -23,11 +23,11 @@ class Relief:
         self._corner = np.asarray(low, np.float64) - 2 * _CELL
         shape = tuple(np.ceil((high + 4 * _CELL - self._corner) / _CELL).astype(int).tolist())
         # every height is shared out among the four nodes around it
-        at = (survey[:, :2] - self._corner) / _CELL
+        cells = (survey[:, :2] - self._corner) / _CELL
         weight = np.zeros(shape)
         total = np.zeros(shape)
-        node = np.floor(at).astype(int)
-        part = at - np.floor(at)
+        node = np.floor(cells).astype(int)
+        part = cells - np.floor(cells)
         for di in (0, 1):
             for dj in (0, 1):
                 share = np.abs(1 - di - part[:, 0]) * np.abs(1 - dj - part[:, 1])
@@ -40,19 +40,19 @@ class Relief:
         height = np.full(shape, float(survey[:, 2].mean()))
         for scale in _SCALES:
             sigma = scale / _CELL
-            near, sums = (
+            weights, sums = (
                 gaussian_filter(a, sigma, mode="constant", truncate=3.0) for a in (weight, total)
             )
             enough = 0.02 / sigma**2  # a fraction of the weight of one point
-            height = (sums + enough * height) / (near + enough)
+            height = (sums + enough * height) / (weights + enough)
         self._coefficients = spline_filter(height, order=3, mode="nearest")
 
     def __call__(self, x: F64, y: F64) -> F64:
         """Heights (n,) in metres at plan positions (n,)."""
-        at = np.stack(
+        cells = np.stack(
             [(np.asarray(x) - self._corner[0]) / _CELL, (np.asarray(y) - self._corner[1]) / _CELL]
         )
         return np.asarray(
-            map_coordinates(self._coefficients, at, order=3, mode="nearest", prefilter=False),
+            map_coordinates(self._coefficients, cells, order=3, mode="nearest", prefilter=False),
             np.float64,
         )

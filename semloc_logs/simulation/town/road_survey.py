@@ -44,33 +44,33 @@ def read_drive(path: Path) -> F64:
     too short, leap, or spread over too large an area.
     """
     read = read_trajectory(TrajectoryFile(path))
-    at = read.poses[:, :3, 3]
+    positions = read.poses[:, :3, 3]
     if read.stamps_ns is None:
-        at = np.column_stack([at[:, 2], -at[:, 0], -at[:, 1]])
-    at = at - at[0]
-    extent = np.ptp(at[:, :2], axis=0) + 100.0
+        positions = np.column_stack([positions[:, 2], -positions[:, 0], -positions[:, 1]])
+    positions = positions - positions[0]
+    extent = np.ptp(positions[:, :2], axis=0) + 100.0
     if not (np.isfinite(extent).all() and extent.prod() * 4 < _MOST_CELLS):
         raise LogError(
             f"The drive of {path} spreads over {extent[0]:.0f} m x {extent[1]:.0f} m, "
             "which is too much: give a part of it."
         )
     kept = [0]
-    for k in range(1, len(at)):  # standing and trembling add nothing to the way
-        if np.hypot(*(at[k, :2] - at[kept[-1], :2])) > 0.7:
+    for k in range(1, len(positions)):  # standing and trembling add nothing to the way
+        if np.hypot(*(positions[k, :2] - positions[kept[-1], :2])) > 0.7:
             kept.append(k)
     if (
         len(kept) < 2
-        or (length := float(np.linalg.norm(np.diff(at[kept, :2], axis=0), axis=1).sum()))
+        or (length := float(np.linalg.norm(np.diff(positions[kept, :2], axis=0), axis=1).sum()))
         < _SHORTEST
     ):
         raise LogError(f"The drive of {path} is shorter than {_SHORTEST:.0f} m: give a longer one.")
-    leaps = np.linalg.norm(np.diff(at[kept, :2], axis=0), axis=1)
+    leaps = np.linalg.norm(np.diff(positions[kept, :2], axis=0), axis=1)
     if leaps.max() > 60:
         raise LogError(
             f"The drive of {path} leaps by {leaps.max():.0f} m "
             f"after pose {kept[int(leaps.argmax())]}: give one without gaps."
         )
-    points = resample(at[kept], length / max(1, round(length)))
+    points = resample(positions[kept], length / max(1, round(length)))
     return np.column_stack(
         [
             gaussian_filter1d(points[:, k], sigma, mode="nearest")
@@ -200,13 +200,13 @@ def _pieces(
     return pieces
 
 
-def _node(nodes: list[F64], at: F64, merge: float = 12.0) -> int:
+def _node(nodes: list[F64], position: F64, merge: float = 12.0) -> int:
     """The number of the crossing at a point (2,): one that is there already, or a new one."""
     if nodes:
-        distance = np.linalg.norm(np.array(nodes) - at, axis=1)
+        distance = np.linalg.norm(np.array(nodes) - position, axis=1)
         if distance.min() < merge:
             return int(distance.argmin())
-    nodes.append(at)
+    nodes.append(position)
     return len(nodes) - 1
 
 

@@ -227,17 +227,17 @@ class Ground:
         for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
             x = self.corner[0] + CELL * (i + di)
             y = self.corner[1] + CELL * (j + dj)
-            at = _at_corners(self.beside, i + di, j + dj)
+            beside = _at_corners(self.beside, i + di, j + dj)
             # corners next to the kerb move onto it, so that it runs smooth across the raster
-            near = np.where(np.abs(at) < 0.6 * CELL, at, 0.0)
+            shift = np.where(np.abs(beside) < 0.6 * CELL, beside, 0.0)
             x, y = (
-                c - near * _at_corners(g, i + di, j + dj)
+                c - shift * _at_corners(g, i + di, j + dj)
                 for c, g in zip((x, y), slope, strict=True)
             )
             up = (
-                self._step(x, y, kind, at)
+                self._step(x, y, kind, beside)
                 - _DEPTH * dug
-                + (self._snow(x, y, kind, at, snow) if snow else 0.0)
+                + (self._snow(x, y, kind, beside, snow) if snow else 0.0)
             )
             corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + up])
         start = 4 * np.arange(len(i), dtype=np.int64)[:, None]

@@ -91,7 +91,7 @@ class GroundPatchSystem:
         patches = None if picture is None else patches_of(picture)
         if patches is None:
             return []
-        found = []
+        answers = []
         for stored in self._stored:
             with np.load(stored.path) as arrays:
                 other = Patches(*(arrays[name] for name in arrays.files))
@@ -99,8 +99,8 @@ class GroundPatchSystem:
             if fit is not None:
                 pose, inliers = fit
                 base_T_base = other.base_T_plane @ pose @ inverse(patches.base_T_plane)
-                found.append(RankedPose(stored.world_T_base @ base_T_base, float(inliers)))
-        return sorted(found, key=lambda pose: -pose.score)[:MOST_POSES]
+                answers.append(RankedPose(stored.world_T_base @ base_T_base, float(inliers)))
+        return sorted(answers, key=lambda pose: -pose.score)[:MOST_POSES]
 
 
 def ground_plane(picture: Picture) -> F64 | None:

@@ -105,13 +105,13 @@ def dense_sift(image: U8, step: int = DENSE_STEP) -> Features:
 
 def sift_points(grey: U8) -> list[cv2.KeyPoint]:
     """Points of SIFT in the octaves of the settings, upright, the strongest."""
-    found = _sift().detect(grey, None)
-    found = [p for p in found if FIRST_OCTAVE <= _octave(p) < FIRST_OCTAVE + OCTAVES]
-    for p in found:
+    key_points = _sift().detect(grey, None)
+    key_points = [p for p in key_points if FIRST_OCTAVE <= _octave(p) < FIRST_OCTAVE + OCTAVES]
+    for p in key_points:
         p.angle = 0.0
     # a point with several orientations was found several times
-    found.sort(key=lambda p: (-p.response, p.pt, p.size))
-    return _distinct(found)[:MOST_FEATURES]
+    key_points.sort(key=lambda p: (-p.response, p.pt, p.size))
+    return _distinct(key_points)[:MOST_FEATURES]
 
 
 def keypoint(x: float, y: float, size: float) -> cv2.KeyPoint:

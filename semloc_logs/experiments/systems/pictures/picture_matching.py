@@ -139,12 +139,12 @@ class PictureSystem:
         features = self._extract(picture.image)
         vectors = features.vectors()
         scores = self._retrieval.scores(picture.image, features)
-        found = []
+        answers = []
         for number in np.argsort(-scores, kind="stable")[:VERIFIED]:
             pose = self._pose(picture, features, vectors, self._stored[number])
             if pose is not None:
-                found.append(pose)
-        return sorted(found, key=lambda pose: -pose.score)[:MOST_POSES]
+                answers.append(pose)
+        return sorted(answers, key=lambda pose: -pose.score)[:MOST_POSES]
 
     def _pose(
         self, picture: Picture, features: Features, vectors: F32, stored: StoredPicture
@@ -156,9 +156,7 @@ class PictureSystem:
         kept = two_view_inliers(features.xy[matches[:, 0]], other.xy[matches[:, 1]])
         matches = matches[kept]
         matches = matches[np.isfinite(points[matches[:, 1]]).all(1)]
-        found = pose_of_points(
-            features.xy[matches[:, 0]], points[matches[:, 1]], picture.intrinsics
-        )
-        if found is None:
+        pose = pose_of_points(features.xy[matches[:, 0]], points[matches[:, 1]], picture.intrinsics)
+        if pose is None:
             return None
-        return RankedPose(stored.world_T_base @ base_pose(found, picture), float(found.inliers))
+        return RankedPose(stored.world_T_base @ base_pose(pose, picture), float(pose.inliers))

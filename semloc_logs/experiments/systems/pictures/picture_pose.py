@@ -51,10 +51,10 @@ def mutual_matches(a: F32, b: F32, places: F32) -> I64:
     rows = np.arange(len(a))
     first = similarity[rows, best]
     mutual = similarity.argmax(0)[best] == rows
-    near = cKDTree(places).query_pairs(SAME_PLACE, output_type="ndarray")
+    neighbours = cKDTree(places).query_pairs(SAME_PLACE, output_type="ndarray")
     beside = [
-        np.r_[near[:, 0], near[:, 1], np.arange(len(b))],
-        np.r_[near[:, 1], near[:, 0], np.arange(len(b))],
+        np.r_[neighbours[:, 0], neighbours[:, 1], np.arange(len(b))],
+        np.r_[neighbours[:, 1], neighbours[:, 0], np.arange(len(b))],
     ]
     order, start = by_cell(beside[0], len(b))
     counts = np.diff(start)[best]
@@ -72,10 +72,10 @@ def mutual_matches(a: F32, b: F32, places: F32) -> I64:
 def points_of(picture: Picture, xy: F32) -> F32:
     """Points (n, 3) that the pixels ``xy`` (n, 2) show, base frame, NaN without depth."""
     height, width = picture.depth.shape
-    near = np.argsort([dx * dx + dy * dy for dx in _WINDOW for dy in _WINDOW], kind="stable")
+    order = np.argsort([dx * dx + dy * dy for dx in _WINDOW for dy in _WINDOW], kind="stable")
     depth = np.full(len(xy), np.nan, np.float32)
     column, row = np.round(xy).astype(int).T
-    for number in near:
+    for number in order:
         dx, dy = _WINDOW[number // len(_WINDOW)], _WINDOW[number % len(_WINDOW)]
         u = np.clip(column + dx, 0, width - 1)
         v = np.clip(row + dy, 0, height - 1)
@@ -141,6 +141,6 @@ def pose_of_points(xy: F32, points: F32, intrinsics: F64) -> PicturePose | None:
     return PicturePose(pose, count) if count >= LEAST_INLIERS else None
 
 
-def base_pose(found: PicturePose, picture: Picture) -> F64:
+def base_pose(answer: PicturePose, picture: Picture) -> F64:
     """``points_T_base`` (4, 4) of the vehicle that took ``picture``."""
-    return np.asarray(inverse(found.camera_T_points) @ inverse(picture.base_T_camera))
+    return np.asarray(inverse(answer.camera_T_points) @ inverse(picture.base_T_camera))

@@ -135,9 +135,9 @@ def small_picture(image: U8) -> U8:
     return np.asarray(cv2.resize(grey, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _turn_error(found: Tensor, wanted: Tensor) -> Tensor:
+def _turn_error(predicted: Tensor, wanted: Tensor) -> Tensor:
     """Distance (n,) of unit quaternions, q and -q being one turn."""
-    return torch.minimum((found - wanted).norm(dim=1), (found + wanted).norm(dim=1))
+    return torch.minimum((predicted - wanted).norm(dim=1), (predicted + wanted).norm(dim=1))
 
 
 def _has_settled(losses: Sequence[float]) -> bool:

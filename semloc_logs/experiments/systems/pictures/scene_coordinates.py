@@ -134,8 +134,8 @@ class SceneCoordinateSystem:
             return []
         grid = _grid(picture)
         with torch.inference_mode():
-            found = self._network(_tensor(grid)).flatten(2)[0].T.numpy()
-        pose = pose_of_points(grid.pixel, found, grid.intrinsics)
+            coordinates = self._network(_tensor(grid)).flatten(2)[0].T.numpy()
+        pose = pose_of_points(grid.pixel, coordinates, grid.intrinsics)
         if pose is None:
             return []
         return [RankedPose(base_pose(pose, picture), float(pose.inliers))]
@@ -153,11 +153,11 @@ class SceneCoordinateSystem:
             if step == self._steps[0]:
                 optimiser = torch.optim.Adam(self._network.parameters(), END_RATE)
             grid, world_T_base, camera_T_world = examples[int(rng.integers(len(examples)))]
-            found = self._network(_tensor(grid)).flatten(2)[0].T
+            coordinates = self._network(_tensor(grid)).flatten(2)[0].T
             if step < self._steps[0]:
-                loss = coordinate_loss(found, grid, world_T_base)
+                loss = coordinate_loss(coordinates, grid, world_T_base)
             else:
-                loss = expected_loss(found, grid.pixel, grid.intrinsics, camera_T_world, rng)
+                loss = expected_loss(coordinates, grid.pixel, grid.intrinsics, camera_T_world, rng)
             if loss is None:
                 continue
             optimiser.zero_grad()
@@ -165,7 +165,7 @@ class SceneCoordinateSystem:
             optimiser.step()
 
 
-def coordinate_loss(found: Tensor, grid: _Grid, world_T_base: F64) -> Tensor | None:
+def coordinate_loss(predicted: Tensor, grid: _Grid, world_T_base: F64) -> Tensor | None:
     """Mean distance of the coordinates from those by the depth, in units of their range.
 
     None without depth. In metres the far points would count most, though a pose depends least on
@@ -177,21 +177,21 @@ def coordinate_loss(found: Tensor, grid: _Grid, world_T_base: F64) -> Tensor | N
     points = grid.points[known]
     truth = torch.from_numpy(apply(world_T_base, points).astype(np.float32))
     far = torch.from_numpy(np.maximum(np.linalg.norm(points, axis=1), NEAREST))
-    off: Tensor = (found[torch.from_numpy(known)] - truth).norm(dim=1) / far
+    off: Tensor = (predicted[torch.from_numpy(known)] - truth).norm(dim=1) / far
     return off.mean()
 
 
 def expected_loss(
-    found: Tensor, pixel: F32, intrinsics: F64, camera_T_world: F64, rng: np.random.Generator
+    predicted: Tensor, pixel: F32, intrinsics: F64, camera_T_world: F64, rng: np.random.Generator
 ) -> Tensor | None:
-    """The expected error of the pose that RANSAC chooses by coordinates ``found`` (n, 3).
+    """The expected error of the pose that RANSAC chooses by coordinates ``predicted`` (n, 3).
 
     None where no hypothesis can be made.
     """
-    poses = hypotheses(found.detach().numpy(), pixel, intrinsics, rng)
+    poses = hypotheses(predicted.detach().numpy(), pixel, intrinsics, rng)
     if not poses:
         return None
-    return chosen_loss(found, pixel, intrinsics, camera_T_world, poses)
+    return chosen_loss(predicted, pixel, intrinsics, camera_T_world, poses)
 
 
 def hypotheses(points: F32, pixel: F32, intrinsics: F64, rng: np.random.Generator) -> list[F64]:
@@ -211,21 +211,25 @@ def hypotheses(points: F32, pixel: F32, intrinsics: F64, rng: np.random.Generato
 
 
 def chosen_loss(
-    found: Tensor, pixel: F32, intrinsics: F64, camera_T_world: F64, poses: Sequence[F64]
+    predicted: Tensor, pixel: F32, intrinsics: F64, camera_T_world: F64, poses: Sequence[F64]
 ) -> Tensor:
     """The mean error of ``poses``, weighted by the probability that each is chosen."""
-    scores = torch.stack([soft_inliers(found, pixel, intrinsics, pose) for pose in poses])
-    losses = torch.tensor([pose_loss(pose, camera_T_world) for pose in poses], dtype=found.dtype)
+    scores = torch.stack([soft_inliers(predicted, pixel, intrinsics, pose) for pose in poses])
+    losses = torch.tensor(
+        [pose_loss(pose, camera_T_world) for pose in poses], dtype=predicted.dtype
+    )
     return (torch.softmax(SCORE_SCALE * scores, 0) * losses).sum()
 
 
-def soft_inliers(found: Tensor, pixel: F32, intrinsics: F64, pose: F64) -> Tensor:
+def soft_inliers(predicted: Tensor, pixel: F32, intrinsics: F64, pose: F64) -> Tensor:
     """How many cells a pose fits: the sum of a sigmoid of their reprojection errors."""
-    T = torch.from_numpy(pose).to(found.dtype)
-    camera = found @ T[:3, :3].T + T[:3, 3]
+    T = torch.from_numpy(pose).to(predicted.dtype)
+    camera = predicted @ T[:3, :3].T + T[:3, 3]
     depth = camera[:, 2].clamp(min=0.1)
-    projected = camera @ torch.from_numpy(intrinsics).to(found.dtype).T
-    off = (projected[:, :2] / depth[:, None] - torch.from_numpy(pixel).to(found.dtype)).norm(dim=1)
+    projected = camera @ torch.from_numpy(intrinsics).to(predicted.dtype).T
+    off = (projected[:, :2] / depth[:, None] - torch.from_numpy(pixel).to(predicted.dtype)).norm(
+        dim=1
+    )
     return torch.sigmoid((INLIER_PIXELS - off.clamp(max=LONGEST)) / SOFTNESS).sum()
 
 

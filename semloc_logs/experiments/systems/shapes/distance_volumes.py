@@ -141,9 +141,9 @@ def describe_points(points: F64, network: Volumes) -> tuple[I64, F32]:
         size = count * STRIDE + EDGE - STRIDE
         volume = distance_volume(points, low.astype(np.float64), (size[0], size[1], size[2]))
         with torch.inference_mode():
-            found = network(_tensor(volume[None]))[0].numpy()
+            described = network(_tensor(volume[None]))[0].numpy()
         i, j, k = (cells[rows] - first).T
-        out[rows] = found[:, i, j, k].T
+        out[rows] = described[:, i, j, k].T
     return cells, out
 
 
@@ -170,8 +170,8 @@ def training_volumes(views: Sequence[View], settings: Resolved) -> tuple[F32, F3
 def _about(points: F64, centre: F64, yaw: float) -> F32:
     """The subvolume about ``centre`` (3,), turned by -``yaw``; all in voxels."""
     off = points - centre
-    near = off[(np.abs(off) < EDGE).all(1)]
-    turned = turned_about_z(near, np.full(len(near), -yaw))
+    inside = off[(np.abs(off) < EDGE).all(1)]
+    turned = turned_about_z(inside, np.full(len(inside), -yaw))
     return distance_volume(turned, np.full(3, -EDGE / 2), (EDGE, EDGE, EDGE))
 
 
@@ -182,8 +182,8 @@ def distance_volume(points: F64, low: F64, shape: tuple[int, int, int]) -> F32:
     """
     out = np.zeros(shape, np.float32)
     high = low + np.array(shape)
-    near = ((points > low - TRUNCATED) & (points < high + TRUNCATED)).all(1)
-    _scatter(points[near] - low, out)
+    is_inside = ((points > low - TRUNCATED) & (points < high + TRUNCATED)).all(1)
+    _scatter(points[is_inside] - low, out)
     return out
 
 

@@ -80,10 +80,10 @@ def _add_pair(p: F64, n: F64, q: F64, m: F64, out: F64) -> None:
 def _simple_histograms(points: F64, normals: F64, cells: Cells, radius: float) -> F64:
     """Simplified histograms (n, 33) of the pairs of each point with its neighbours."""
     out = np.zeros((len(points), SIZE))
-    near = np.empty(len(points), np.int64)
+    nearby_rows = np.empty(len(points), np.int64)
     for row in range(len(points)):
-        count = neighbours(points, cells, row, radius, near)
-        for other in near[:count]:
+        count = neighbours(points, cells, row, radius, nearby_rows)
+        for other in nearby_rows[:count]:
             _add_pair(points[row], normals[row], points[other], normals[other], out[row])
         _scale(out[row])
     return out
@@ -101,13 +101,13 @@ def _scale(histogram: F64) -> None:
 def _weighted_sums(points: F64, simple: F64, cells: Cells, keypoints: I64, radius: float) -> F32:
     """The histogram of each keypoint and the mean of its neighbours', weighted by 1 / distance."""
     out = np.zeros((len(keypoints), SIZE), np.float32)
-    near = np.empty(len(points), np.int64)
+    nearby_rows = np.empty(len(points), np.int64)
     total = np.empty(SIZE)
     for number in range(len(keypoints)):
         row = keypoints[number]
-        count = neighbours(points, cells, row, radius, near)
+        count = neighbours(points, cells, row, radius, nearby_rows)
         total[:] = 0.0
-        for other in near[:count]:
+        for other in nearby_rows[:count]:
             dx = points[other, 0] - points[row, 0]
             dy = points[other, 1] - points[row, 1]
             dz = points[other, 2] - points[row, 2]

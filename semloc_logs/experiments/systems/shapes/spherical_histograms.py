@@ -129,9 +129,9 @@ def training_pairs(views: Sequence[View], settings: Resolved) -> tuple[F32, F32,
         if not len(rows):
             continue
         distance, nearest = tree.query(points[rows], workers=1)
-        near = distance < NEAR * v
-        rows = rows[near]
-        nearest = nearest[near]
+        is_near = distance < NEAR * v
+        rows = rows[is_near]
+        nearest = nearest[is_near]
         anchors.append(spherical_histograms(points, view_normals, rows, radius))
         positives.append(spherical_histograms(complete, normals, nearest, radius))
         places.append(points[rows])
@@ -173,16 +173,16 @@ def _frame(offsets: F64, normal: F64) -> F64:
 @njit(cache=True, nogil=True)
 def _histograms(points: F64, normals: F64, cells: Cells, keypoints: I64, radius: float) -> F32:
     out = np.zeros((len(keypoints), SIZE), np.float32)
-    near = np.empty(len(points), np.int64)
+    nearby_rows = np.empty(len(points), np.int64)
     step = np.log(1.0 / LEAST_RADIUS) / (RADIAL - 1)
     for number in range(len(keypoints)):
         row = keypoints[number]
-        count = neighbours(points, cells, row, radius, near)
+        count = neighbours(points, cells, row, radius, nearby_rows)
         if not count:
             continue
         offsets = np.empty((count, 3))
         for m in range(count):
-            offsets[m] = points[near[m]] - points[row]
+            offsets[m] = points[nearby_rows[m]] - points[row]
         local = offsets @ _frame(offsets, normals[row]).T
         for x, y, z in local:
             far = np.sqrt(x * x + y * y + z * z)

@@ -111,10 +111,10 @@ class Verifier:
 
     def _complete_tiles(self, poses: F64, radius: float) -> None:
         """Find the closest voxels in all tiles that a query of ``radius`` voxels reaches."""
-        at = poses[:, 1:3] / self._voxel_size - self._low[:2]
+        cells = poses[:, 1:3] / self._voxel_size - self._low[:2]
         reach = radius + 2 * self._margin
-        first = np.clip(np.floor((at - reach) / TILE).astype(int), 0, self._is_known.shape)
-        last = np.clip(np.ceil((at + reach) / TILE).astype(int), 0, self._is_known.shape)
+        first = np.clip(np.floor((cells - reach) / TILE).astype(int), 0, self._is_known.shape)
+        last = np.clip(np.ceil((cells + reach) / TILE).astype(int), 0, self._is_known.shape)
         for i, j, k, m in np.unique(np.c_[first, last], axis=0):
             for x in range(i, k):
                 for y in range(j, m):
