@@ -55,8 +55,11 @@ def empty_names(path: Path) -> Iterator[tuple[int, str]]:
     for node in nodes.values():
         if isinstance(node, ast.arg) and node.arg in EMPTY_NAMES and OPTIONS not in str(path):
             yield node.lineno, node.arg
-        is_stored = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
-        if is_stored and node.id in EMPTY_NAMES:
+        if (
+            isinstance(node, ast.Name)
+            and node.id in EMPTY_NAMES
+            and isinstance(node.ctx, ast.Store)
+        ):
             yield node.lineno, node.id
 
 

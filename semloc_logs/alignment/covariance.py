@@ -73,8 +73,7 @@ def covariance_of(
     map_T_query: F64,
     map_T_target: F64,
     voxel_size: float,
-    query: Stretch = Stretch(),
-    target: Stretch = Stretch(),
+    stretches: tuple[Stretch, Stretch] = (Stretch(), Stretch()),
     *,
     uncertain: bool = False,
 ) -> F64:
@@ -83,11 +82,12 @@ def covariance_of(
     What noisy normals alone would claim to know is taken off first. Where the points then hold
     nothing (along a corridor) the error is as large as the search lets it be: the bounds of the
     same place. Uncertain ranges may all be too long or too short, and level ground may be lifted,
-    which no number of points averages out. Along the stretches of road that made the maps poses
-    drift: the map of the ``target`` is off and turned against its pose, which moves a query that
-    stands aside, and the map of the ``query`` against its own. ``uncertain``: whether the ranges of
-    either side are.
+    which no number of points averages out. Along the ``stretches`` of road that made the maps of
+    query and target poses drift: the map of the target is off and turned against its pose, which
+    moves a query that stands aside, and the map of the query against its own. ``uncertain``:
+    whether the ranges of either side are.
     """
+    query, target = stretches
     share = max(fit.inliers, LEAST_SHARE)
     inflation = max(LEAST_INFLATION, INFLATION_OF_SHARE / share**2)
     about_centre = _about_centre(fit, voxel_size, UNCERTAIN_INFLATION if uncertain else inflation)

@@ -390,8 +390,10 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
             map_T_query_base,
             map_T_target,
             context.voxel_size,
-            stretch(session, context.keyframe, members),
-            stretch(target_session, nearest, fitted.keyframes),
+            (
+                stretch(session, context.keyframe, members),
+                stretch(target_session, nearest, fitted.keyframes),
+            ),
             uncertain=is_uncertain(fitted.range_sigma, context.voxel_size),
         ),
         overlap=overlap,

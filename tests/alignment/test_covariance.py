@@ -288,7 +288,7 @@ def added(query: Stretch, target: Stretch, target_T_query: F64) -> F64:
     """What the drift along both stretches adds to a covariance (6, 6)."""
     found = fit(np.eye(4), SMALL)
     alone, bridged = (
-        covariance_of(found, target_T_query, np.eye(4), 0.3, *stretches)
+        covariance_of(found, target_T_query, np.eye(4), 0.3, stretches)
         for stretches in ((Stretch(), Stretch()), (query, target))
     )
     return bridged - alone

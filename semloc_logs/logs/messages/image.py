@@ -34,15 +34,9 @@ def _raw(header: Header, m: Any) -> Iterator[Frame]:
     encoding = str(m.encoding)
     big_endian = bool(getattr(m, "is_bigendian", False))
     of_depth = image_codecs.is_depth(header.topic, encoding)
-    pixels = image_codecs.decode_raw(
-        binary(m.data),
-        int(m.width or 0),
-        int(m.height or 0),
-        int(m.step or 0),
-        encoding,
-        big_endian,
-        of_depth=of_depth,
-    )
+    size = (int(m.width or 0), int(m.height or 0), int(m.step or 0))
+    layout = image_codecs.Layout(*size, encoding, big_endian)
+    pixels = image_codecs.decode_raw(binary(m.data), layout, of_depth=of_depth)
     yield from _picture(header, pixels, encoding, of_depth)
 
 

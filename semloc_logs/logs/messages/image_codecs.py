@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -84,20 +84,22 @@ def _is_rough_beside(pixels: NDArray[np.uint16], other: np.dtype[Any], *, of_dep
     return roughness(rows) > _ROUGHER * max(roughness(rows.view(other)), 1.0)
 
 
-def decode_raw(
-    data: bytes | memoryview,
-    width: int,
-    height: int,
-    step: int,
-    encoding: str,
-    big_endian: bool,
-    *,
-    of_depth: bool = False,
-) -> Image | F32:
+class Layout(NamedTuple):
+    """How the bytes of a raw picture are to be read; ``step`` is the bytes of a row."""
+
+    width: int
+    height: int
+    step: int
+    encoding: str
+    big_endian: bool
+
+
+def decode_raw(data: bytes | memoryview, layout: Layout, *, of_depth: bool = False) -> Image | F32:
     """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. ``of_depth``: the pixels are depths.
 
     UndecodableError when the size does not fit the data.
     """
+    width, height, step, encoding, big_endian = layout
     try:
         kind, channels, conversion = _RAW[encoding.strip().lower()]
     except KeyError:

@@ -44,7 +44,7 @@ class CameraClouds:
         """Depth units, and calibrations (lost) and label images that cannot be used."""
         return [
             *self._depth.units.problems,
-            *self._depth.limits.problems,
+            *self._depth.unmeasured.problems,
             *self._depth.problems,
             *self._stereo.problems,
             *self.labels.problems,

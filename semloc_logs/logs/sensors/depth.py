@@ -16,8 +16,8 @@ from semloc_logs.logs.messages.image_codecs import METRE, MILLIMETRE, depth_metr
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.picture_calibration import Lens, fitted_camera, optics_of
-from semloc_logs.logs.sensors.range_limits import RangeLimits
 from semloc_logs.logs.sensors.stereo import DISPARITY_NOISE
+from semloc_logs.logs.sensors.unmeasured_depths import UnmeasuredDepths
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row
 # a label image belongs to a depth image within half a period at 30 Hz
@@ -282,7 +282,7 @@ class DepthClouds:
 
     ``calibrations``: the newest one by CameraInfo topic; ``problems`` name the unusable ones.
     ``units``: what the values of the images are in, ``unit`` (m) where the user gives it.
-    ``limits``: depths that stand for no measurement.
+    ``unmeasured``: depths that stand for no measurement.
     """
 
     def __init__(
@@ -293,7 +293,7 @@ class DepthClouds:
         unit: float | None = None,
     ) -> None:
         self.units = DepthUnits(unit)
-        self.limits = RangeLimits()
+        self.unmeasured = UnmeasuredDepths()
         self.calibrations: dict[str, Camera] = {}
         self.labels = LabelImages(roles)
         self.problems = Problems()
@@ -321,7 +321,7 @@ class DepthClouds:
         unprojector = self._unprojector(topic, camera, depth.shape)
         if unprojector is None:
             return NoCloud.UNUSABLE_CALIBRATION
-        depth = self.limits.measured(topic, depth, max_range)
+        depth = self.unmeasured.measured(topic, depth, max_range)
         points, pixels = unprojector.points(depth, min_range, max_range)
         label = self.labels.of(frame, depth.shape)
         return RangePoints(

@@ -78,7 +78,7 @@ class CloudBuilder:
         self.duplicates = duplicates
         self._roles = roles
         self._poses = poses
-        self._cameras = cameras
+        self.cameras = cameras
         self._limits = limits
 
     def cloud(self, frame: RangeFrame, *, is_end: bool, is_set_back: bool) -> PosedCloud | NoCloud:
@@ -173,14 +173,14 @@ class CloudBuilder:
         return PosedCloud(header, points, origin, place.session_T_base, label)
 
     def _picture(self, frame: DepthFrame | ImageFrame, place: _Place) -> PosedCloud | NoCloud:
-        seen = self._cameras.points(frame, self._limits.nearest, self._limits.farthest)
+        seen = self.cameras.points(frame, self._limits.nearest, self._limits.farthest)
         if isinstance(seen, NoCloud):
             return seen
         label_topic = None
         label_form = LabelForm.IDS
         if seen.label is not None:
             label_topic = self._roles.label_of.get(frame.header.topic)
-            if label_topic in self._cameras.labels.coloured:
+            if label_topic in self.cameras.labels.coloured:
                 label_form = LabelForm.COLOURS
         return PosedCloud(
             frame.header,

@@ -21,7 +21,6 @@ from semloc_logs.logs.poses.fixes import Fixes
 from semloc_logs.logs.poses.imu_gravity import Accelerometer
 from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.session.cloud_builder import CloudBuilder
 from semloc_logs.logs.session.frame_queue import MOST_WAITING_BYTES, FrameQueue, RangeFrame
 from semloc_logs.logs.session.image_relay import ImageRelay
@@ -44,14 +43,13 @@ class CloudPass:
         self,
         roles: Roles,
         poses: BasePoses,
-        cameras: CameraClouds,
         builder: CloudBuilder,
         relay: ImageRelay,
         stamp_offsets: StampOffsets,
         most_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
         self.poses = poses
-        self.cameras = cameras
+        self.cameras = builder.cameras
         self.builder = builder
         self.accelerometer = Accelerometer()
         self.fixes = Fixes()

@@ -421,4 +421,4 @@ class Session:
         builder = CloudBuilder(roles, poses, cameras, duplicates, limits)
         most_bytes = self._options.logs.memory // _SHARE_OF_WAITING
         stamp_offsets = StampOffsets(self._reading.offset_ns)
-        return CloudPass(roles, poses, cameras, builder, relay, stamp_offsets, most_bytes)
+        return CloudPass(roles, poses, builder, relay, stamp_offsets, most_bytes)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.image_codecs import (
+    Layout,
     decode_compressed,
     decode_compressed_depth,
     decode_raw,
@@ -42,23 +43,23 @@ def png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     ],
 )
 def test_two_pixels_by_hand(encoding: str, data: bytes, expected: list[object]) -> None:
-    assert decode_raw(data, 2, 1, len(data), encoding, False).tolist() == expected
+    assert decode_raw(data, Layout(2, 1, len(data), encoding, False)).tolist() == expected
 
 
 def test_row_padding_and_byte_order() -> None:
     data = struct.pack(">HHxxHHxx", 1, 2, 3, 4)
-    assert decode_raw(data, 2, 2, 6, "16UC1", True).tolist() == [[1, 2], [3, 4]]
+    assert decode_raw(data, Layout(2, 2, 6, "16UC1", True)).tolist() == [[1, 2], [3, 4]]
 
 
 def test_signed_values() -> None:
     """32SC1 carries labels, 16SC1 depth; below 0 is nothing."""
-    pixels = decode_raw(struct.pack("<hh", -1, 1500), 2, 1, 4, "16SC1", big_endian=False)
+    pixels = decode_raw(struct.pack("<hh", -1, 1500), Layout(2, 1, 4, "16SC1", big_endian=False))
     assert pixels.tolist() == [[0, 1500]]
-    pixels = decode_raw(struct.pack(">ii", 7, 40_000), 2, 1, 8, "32SC1", big_endian=True)
+    pixels = decode_raw(struct.pack(">ii", 7, 40_000), Layout(2, 1, 8, "32SC1", big_endian=True))
     assert pixels.dtype == np.dtype(np.uint16)
     assert pixels.tolist() == [[7, 40_000]]
     with pytest.raises(UndecodableError, match="70000 does not fit 16 bits"):
-        decode_raw(struct.pack("<i", 70_000), 1, 1, 4, "32SC1", big_endian=False)
+        decode_raw(struct.pack("<i", 70_000), Layout(1, 1, 4, "32SC1", big_endian=False))
 
 
 @pytest.mark.parametrize(
@@ -67,7 +68,7 @@ def test_signed_values() -> None:
 def test_bayer_patterns_put_red_where_it_is(pattern: str, site: tuple[int, int]) -> None:
     mosaic = np.zeros((8, 8), np.uint8)
     mosaic[site[0] :: 2, site[1] :: 2] = 200  # light on the red sites only
-    rgb = decode_raw(mosaic.tobytes(), 8, 8, 8, f"bayer_{pattern}8", False)
+    rgb = decode_raw(mosaic.tobytes(), Layout(8, 8, 8, f"bayer_{pattern}8", False))
     assert rgb[2:6, 2:6, 0].min() == 200
     assert rgb[2:6, 2:6, 1:].max() == 0
 
@@ -78,7 +79,7 @@ def test_bayer_patterns_put_red_where_it_is(pattern: str, site: tuple[int, int])
 )
 def test_claims_beyond_the_data_are_refused(width: int, height: int, encoding: str) -> None:
     with pytest.raises(UndecodableError):
-        decode_raw(b"\0\0", width, height, 0, encoding, False)
+        decode_raw(b"\0\0", Layout(width, height, 0, encoding, False))
 
 
 def test_png_keeps_grey_and_16_bits_and_gives_rgb() -> None:
@@ -232,7 +233,7 @@ def test_a_wrong_flag_for_the_order_of_bytes_is_seen_from_neighbouring_pixels(is
     depth[::9, ::11] = 0
     data = depth.astype(">u2" if is_big else "<u2").tobytes()
     for flag in (False, True):
-        np.testing.assert_array_equal(decode_raw(data, 80, 60, 160, "16UC1", flag), depth)
+        np.testing.assert_array_equal(decode_raw(data, Layout(80, 60, 160, "16UC1", flag)), depth)
 
 
 @pytest.mark.parametrize("is_big", [False, True])
@@ -240,27 +241,27 @@ def test_depths_of_which_most_are_the_same_show_the_order_of_bytes_too(is_big: b
     depth = np.repeat(1500 + 7 * np.arange(20), 4)[None].repeat(60, 0).astype(np.uint16)
     data = depth.astype(">u2" if is_big else "<u2").tobytes()
     for flag in (False, True):
-        pixels = decode_raw(data, 80, 60, 160, "16UC1", flag, of_depth=True)
+        pixels = decode_raw(data, Layout(80, 60, 160, "16UC1", flag), of_depth=True)
         np.testing.assert_array_equal(pixels, depth)
 
 
 def test_labels_in_steps_of_256_keep_their_order_of_bytes() -> None:
     labels = np.repeat(256 * np.arange(1, 21), 4)[None].repeat(60, 0).astype(np.uint16)
-    pixels = decode_raw(labels.astype("<u2").tobytes(), 80, 60, 160, "mono16", False)
+    pixels = decode_raw(labels.astype("<u2").tobytes(), Layout(80, 60, 160, "mono16", False))
     np.testing.assert_array_equal(pixels, labels)
 
 
 @pytest.mark.parametrize(("encoding", "times"), [("mono8", 4), ("16UC1", 2)])
 def test_rows_many_times_as_long_as_their_pixels_are_refused(encoding: str, times: int) -> None:
     with pytest.raises(UndecodableError, match=f"its rows of 32 bytes are {times} times as long"):
-        decode_raw(bytes(320), 8, 10, 32, encoding, big_endian=False, of_depth=True)
-    padded = decode_raw(bytes(200), 8, 10, 20, "16UC1", big_endian=False, of_depth=True)
+        decode_raw(bytes(320), Layout(8, 10, 32, encoding, big_endian=False), of_depth=True)
+    padded = decode_raw(bytes(200), Layout(8, 10, 20, "16UC1", big_endian=False), of_depth=True)
     assert padded.shape == (10, 8)
 
 
 def test_a_picture_may_be_the_left_half_of_a_wider_one() -> None:
     wide = np.arange(160, dtype=np.uint8).reshape(10, 16)
-    left = decode_raw(wide.tobytes(), 8, 10, 16, "mono8", big_endian=False)
+    left = decode_raw(wide.tobytes(), Layout(8, 10, 16, "mono8", big_endian=False))
     np.testing.assert_array_equal(left, wide[:, :8])
 
 
@@ -268,4 +269,4 @@ def test_a_noisy_picture_keeps_the_order_that_it_names() -> None:
     noise = np.random.default_rng(1).integers(0, 1 << 16, (60, 80)).astype(np.uint16)
     for order, flag in (("<u2", False), (">u2", True)):
         data = noise.astype(order).tobytes()
-        np.testing.assert_array_equal(decode_raw(data, 80, 60, 160, "mono16", flag), noise)
+        np.testing.assert_array_equal(decode_raw(data, Layout(80, 60, 160, "mono16", flag)), noise)

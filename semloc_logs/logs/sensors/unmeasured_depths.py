@@ -41,7 +41,7 @@ class _Largest:
         return self.count >= MOSTLY * self.pictures
 
 
-class RangeLimits:
+class UnmeasuredDepths:
     """The limits of the topics; ``problems`` name them."""
 
     def __init__(self) -> None:

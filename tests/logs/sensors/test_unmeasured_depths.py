@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.logs.problems import sentences
-from semloc_logs.logs.sensors.range_limits import FEWEST, RangeLimits
+from semloc_logs.logs.sensors.unmeasured_depths import FEWEST, UnmeasuredDepths
 
 F32 = NDArray[np.float32]
 TOPIC = "/depth"
@@ -19,13 +19,13 @@ def picture(number: int, filled: int, fill: float = 8.0) -> F32:
     return depth.reshape(10, 10)
 
 
-def shown(limits: RangeLimits, pictures: list[F32], max_range: float = 20.0) -> list[int]:
+def shown(limits: UnmeasuredDepths, pictures: list[F32], max_range: float = 20.0) -> list[int]:
     """How many pixels of each picture were measured."""
     return [int((limits.measured(TOPIC, p, max_range) > 0).sum()) for p in pictures]
 
 
 def test_pixels_of_one_largest_depth_are_left_out_and_named_once_it_is_sure() -> None:
-    limits = RangeLimits()
+    limits = UnmeasuredDepths()
     assert shown(limits, [picture(number, 30) for number in range(FEWEST - 1)]) == [70] * 9
     assert sentences(limits.problems) == []
     assert shown(limits, [picture(FEWEST, 30)]) == [70]
@@ -37,25 +37,25 @@ def test_pixels_of_one_largest_depth_are_left_out_and_named_once_it_is_sure() ->
 
 
 def test_what_changes_with_the_scene_is_measured() -> None:
-    few = RangeLimits()
+    few = UnmeasuredDepths()
     assert shown(few, [picture(n, 4) for n in range(20)]) == [100] * 20
-    moving = RangeLimits()
+    moving = UnmeasuredDepths()
     walls = [picture(n, 60, fill=8.0 - 0.05 * n) for n in range(20)]
     assert shown(moving, walls) == [40] + [100] * 19  # the first one may be a limit
-    sometimes = RangeLimits()
+    sometimes = UnmeasuredDepths()
     assert shown(sometimes, [picture(n, 30 * (n % 2)) for n in range(40)])[2:] == [100] * 38
     for limits in (few, moving, sometimes):
         assert sentences(limits.problems) == []
 
 
 def test_a_limit_out_of_range_is_left_out_without_a_word() -> None:
-    limits = RangeLimits()
+    limits = UnmeasuredDepths()
     shown(limits, [picture(n, 30, fill=1000.0) for n in range(20)])
     assert sentences(limits.problems) == []
 
 
 def test_a_limit_that_is_seen_later_is_found() -> None:
-    limits = RangeLimits()
+    limits = UnmeasuredDepths()
     counts = shown(limits, [picture(n, 0) for n in range(4)])
     assert counts == [100] * 4
     counts = shown(limits, [picture(n, 30) for n in range(40)])
@@ -63,7 +63,7 @@ def test_a_limit_that_is_seen_later_is_found() -> None:
 
 
 def test_nothing_measured_is_no_limit() -> None:
-    limits = RangeLimits()
+    limits = UnmeasuredDepths()
     empty = np.zeros((10, 10), np.float32)
     assert shown(limits, [empty] * 20) == [0] * 20
     unknown = np.full((10, 10), np.nan, np.float32)
