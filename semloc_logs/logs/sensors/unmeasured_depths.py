@@ -58,7 +58,9 @@ class UnmeasuredDepths:
         share = float(is_limit.mean())
         largest = self._largest.setdefault(topic, _Largest())
         largest.add(limit if share >= LEAST_SHARE else 0.0)
-        if not largest.is_limit or limit != largest.depth:
+        # a picture of nothing else may be a wall
+        is_sure = largest.count >= FEWEST or share < 1.0
+        if not is_sure or not largest.is_limit or limit != largest.depth:
             return depth
         if largest.count >= FEWEST:
             self._name(topic, limit)

@@ -62,6 +62,12 @@ def test_a_limit_that_is_seen_later_is_found() -> None:
     assert counts[-1] == 70
 
 
+def test_a_picture_of_one_depth_alone_may_be_a_wall_at_first() -> None:
+    limits = UnmeasuredDepths()
+    walls = [picture(n, 100) for n in range(FEWEST + 1)]
+    assert shown(limits, walls) == [100] * (FEWEST - 1) + [0, 0]
+
+
 def test_nothing_measured_is_no_limit() -> None:
     limits = UnmeasuredDepths()
     empty = np.zeros((10, 10), np.float32)
