@@ -38,7 +38,7 @@ class _Largest:
     @property
     def is_limit(self) -> bool:
         """Whether pixels of this depth are taken to have no measurement."""
-        return self.count >= MOSTLY * self.pictures
+        return self.count > 0 and self.count >= MOSTLY * self.pictures
 
 
 class UnmeasuredDepths:
@@ -57,10 +57,11 @@ class UnmeasuredDepths:
         is_limit = depth == limit
         share = float(is_limit.mean())
         largest = self._largest.setdefault(topic, _Largest())
-        largest.add(limit if share >= LEAST_SHARE else 0.0)
-        # a picture of nothing else may be a wall
-        is_sure = largest.count >= FEWEST or share < 1.0
-        if not is_sure or not largest.is_limit or limit != largest.depth:
+        if share < 1.0:  # a picture of nothing else may be a wall
+            largest.add(limit if share >= LEAST_SHARE else 0.0)
+        elif largest.count < FEWEST:
+            return depth
+        if not largest.is_limit or limit != largest.depth:
             return depth
         if largest.count >= FEWEST:
             self._name(topic, limit)

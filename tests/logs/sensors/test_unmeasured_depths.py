@@ -62,10 +62,13 @@ def test_a_limit_that_is_seen_later_is_found() -> None:
     assert counts[-1] == 70
 
 
-def test_a_picture_of_one_depth_alone_may_be_a_wall_at_first() -> None:
+def test_pictures_of_one_depth_alone_are_a_wall_unless_others_showed_the_limit() -> None:
     limits = UnmeasuredDepths()
-    walls = [picture(n, 100) for n in range(FEWEST + 1)]
-    assert shown(limits, walls) == [100] * (FEWEST - 1) + [0, 0]
+    wall = picture(0, 100)
+    assert shown(limits, [wall] * 20) == [100] * 20
+    assert sentences(limits.problems) == []
+    shown(limits, [picture(n, 30) for n in range(FEWEST)])
+    assert shown(limits, [wall]) == [0]
 
 
 def test_nothing_measured_is_no_limit() -> None:
