@@ -57,7 +57,8 @@ class UnmeasuredDepths:
         is_limit = depth == limit
         share = float(is_limit.mean())
         largest = self._largest.setdefault(topic, _Largest())
-        if share < 1.0:  # a picture of nothing else may be a wall
+        has_others = bool(((known > 0) & (known < limit)).any())
+        if has_others:  # a picture of nothing else may be a wall
             largest.add(limit if share >= LEAST_SHARE else 0.0)
         elif largest.count < FEWEST:
             return depth

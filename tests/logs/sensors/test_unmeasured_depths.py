@@ -65,7 +65,8 @@ def test_a_limit_that_is_seen_later_is_found() -> None:
 def test_pictures_of_one_depth_alone_are_a_wall_unless_others_showed_the_limit() -> None:
     limits = UnmeasuredDepths()
     wall = picture(0, 100)
-    assert shown(limits, [wall] * 20) == [100] * 20
+    wall[0, :3] = 0.0, np.nan, -1.0
+    assert shown(limits, [wall] * 20) == [97] * 20
     assert sentences(limits.problems) == []
     shown(limits, [picture(n, 30) for n in range(FEWEST)])
     assert shown(limits, [wall]) == [0]
