@@ -34,6 +34,8 @@ def session(
     ("other", "words"),
     [
         (session(z=0.0, height=1.9), "at z = 1.90 m in one and at 0.00 m in the other"),
+        (session(z=0.0, height=1.4), "at z = 1.90 m in one and at 0.00 m in the other"),
+        (session(roll=18.0, hidden=("rotation_x_rad",)), "turned by 18.0 degrees about x"),
         (session(x=1.8, hidden=("lever_x_m",)), "shifted by 1.50 m along x between both"),
         (session(roll=5.0, hidden=("rotation_x_rad",)), "turned by 5.0 degrees about x"),
     ],
@@ -51,6 +53,8 @@ def test_mountings_of_which_one_is_wrong_are_named(other: Mounted, words: str) -
         session(),
         session(z=0.0, height=0.0),  # a low vehicle: its sensor is lower, too
         session(z=0.0, height=np.nan),
+        session(z=0.0, height=0.9),  # neither as high nor as low
+        session(roll=22.0, hidden=("rotation_x_rad",)),  # a base frame of other axes
         session(x=1.8),  # another vehicle, whose drive showed that its mounting fits
         session(x=0.9, hidden=("lever_x_m",)),  # 0.6 m: 2 voxels
         session(z=-1.9, roll=180.0, hidden=("rotation_x_rad",)),  # a base frame with z down
@@ -82,6 +86,15 @@ def mounted_at(x: float, camera_x: float = 0.0, hidden: tuple[str, ...] = ("leve
             "fit": {"streams": [stream]},
         },
     )
+
+
+def test_the_height_is_of_the_keyframes_that_saw_ground() -> None:
+    drive = mounted_at(0.0)
+    drive.map_T_base = np.array([exp_se3(np.array([7.0, 8.0, z]), np.zeros(3)) for z in (0.2, 9.0)])
+    drive.ground_z = np.array([-1.7, np.nan])
+    assert Mounted.of(drive).height == pytest.approx(1.9)
+    drive.ground_z[0] = np.nan
+    assert np.isnan(Mounted.of(drive).height)
 
 
 def test_a_camera_that_only_paints_labels_is_not_compared() -> None:

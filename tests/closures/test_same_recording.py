@@ -48,10 +48,12 @@ def test_sessions_of_one_recording_are_named(a: Any, b: Any, count: int) -> None
 
 
 def test_many_copies_are_one_sentence() -> None:
-    """Five copies and a part of one of them; two copies of another recording."""
+    """Five copies and a part of one of them; two and three copies of other recordings."""
     maps = {name: session(0, 20) for name in "fecba"} | {"d": session(15, 40)}
     maps |= {name: session(0, 9, seed=1) for name in "yx"}
-    first, second = same_recordings(maps)
+    maps |= {name: session(0, 8, seed=2) for name in "rqp"}
+    first, third, second = same_recordings(maps)
+    assert third.startswith("Sessions p, q and r are of one recording: 8 of their keyframes are")
     assert first.startswith(
         "Sessions a, b, c, d and 2 others are of one recording: 20 of their keyframes are"
     )

@@ -38,7 +38,7 @@ class _Largest:
     @property
     def is_limit(self) -> bool:
         """Whether pixels of this depth are taken to have no measurement."""
-        return self.count > 0 and self.count >= MOSTLY * self.pictures
+        return self.count >= MOSTLY * self.pictures
 
 
 class UnmeasuredDepths:
@@ -52,7 +52,7 @@ class UnmeasuredDepths:
         """The next ``depth`` (h, w) of a topic in metres, 0 where it was not measured."""
         known = depth[np.isfinite(depth)]
         limit = float(known.max()) if len(known) else 0.0
-        if not 0.0 < limit <= max_range:  # such pixels are left out anyway
+        if limit > max_range:  # such pixels are left out anyway
             return depth
         is_limit = depth == limit
         share = float(is_limit.mean())

@@ -39,6 +39,7 @@ def test_pixels_of_one_largest_depth_are_left_out_and_named_once_it_is_sure() ->
 def test_what_changes_with_the_scene_is_measured() -> None:
     few = UnmeasuredDepths()
     assert shown(few, [picture(n, 4) for n in range(20)]) == [100] * 20
+    assert shown(UnmeasuredDepths(), [picture(0, 5)]) == [95]  # a twentieth
     moving = UnmeasuredDepths()
     walls = [picture(n, 60, fill=8.0 - 0.05 * n) for n in range(20)]
     assert shown(moving, walls) == [40] + [100] * 19  # the first one may be a limit
@@ -46,6 +47,13 @@ def test_what_changes_with_the_scene_is_measured() -> None:
     assert shown(sometimes, [picture(n, 30 * (n % 2)) for n in range(40)])[2:] == [100] * 38
     for limits in (few, moving, sometimes):
         assert sentences(limits.problems) == []
+
+
+def test_four_of_five_pictures_are_enough() -> None:
+    filled = [30] * 7 + [0] * 2 + [30]
+    pictures = [picture(n, count) for n, count in enumerate(filled)]
+    assert shown(UnmeasuredDepths(), pictures)[-1] == 70
+    assert shown(UnmeasuredDepths(), [picture(99, 0), *pictures])[-1] == 100
 
 
 def test_a_limit_out_of_range_is_left_out_without_a_word() -> None:
