@@ -31,7 +31,8 @@ def session(first: int, last: int, seed: int = 0) -> Any:
         (session(0, 20), session(0, 20), 20),  # one log under two names
         (session(0, 20), session(15, 40), 5),  # a part that both have
         (session(0, 1), session(0, 1), 1),  # single sweeps
-        (session(0, 20), session(18, 40), 0),  # two keyframes of many
+        (session(0, 20), session(17, 40), 3),  # three keyframes of many
+        (session(0, 20), session(18, 40), 0),  # two
         (session(0, 20), session(0, 20, seed=1), 0),  # simulated time starts at 0 in both
         (session(0, 20), session(20, 40), 0),
     ],
@@ -58,6 +59,12 @@ def test_many_copies_are_one_sentence() -> None:
         "Sessions a, b, c, d and 2 others are of one recording: 20 of their keyframes are"
     )
     assert second.startswith("Sessions x and y are of one recording: 9 of their keyframes are")
+
+
+def test_a_sweep_between_the_keyframes_of_a_drive_is_not_of_it() -> None:
+    sweep = session(5, 6)
+    sweep.stamps_ns = sweep.stamps_ns + S // 2
+    assert same_recordings({"drive": session(0, 20), "sweep": sweep}) == []
 
 
 def test_sessions_of_earlier_versions_are_not_compared() -> None:
