@@ -32,6 +32,8 @@ def test_pixels_of_one_largest_depth_are_left_out_and_named_once_it_is_sure() ->
     [sentence] = sentences(limits.problems)
     assert sentence.startswith("/depth: many pixels of nearly all pictures have the largest depth,")
     assert "8.000 m" in sentence
+    [problem] = limits.problems
+    assert (problem.lost, problem.assumed) == (False, False)  # nothing was measured there
     # a picture without such pixels is as it was measured
     assert shown(limits, [picture(0, 0)]) == [100]
 
