@@ -6,13 +6,10 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from semloc_logs.closures.other_mountings import contradictions
+from semloc_logs.closures.other_mountings import Both, contradictions
 from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
-
-# by both names
-Both = frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +33,7 @@ class Exclusions:
 
     def has(self, pair: Pair) -> bool:
         """Whether a pair gets no closures."""
-        both = frozenset((pair.query, pair.target))
+        both = Both((pair.query, pair.target))
         return bool(self.misfits.keys() & both) or both in self.pairs
 
     def sentences(self) -> list[str]:

@@ -19,6 +19,7 @@ from semloc_logs.mapping.fit.findings import LEAST_PAIRS, NAMES, NEAR_VOXELS
 from semloc_logs.mapping.session_map import SessionMap
 
 F64 = NDArray[np.float64]
+Both = frozenset[str]  # two sessions by name
 
 # voxels by which such a difference moves a closure, at least; 0.75 m or 4.3 degrees at street scale
 LEAST = 2.5
@@ -72,7 +73,7 @@ def _base_T_sensors(session: SessionMap) -> dict[str, Any]:
     return {frame: T for frame, T in base_T_sensors.items() if frame in frames}
 
 
-def contradictions(maps: Mapping[str, SessionMap]) -> dict[frozenset[str], str]:
+def contradictions(maps: Mapping[str, SessionMap]) -> dict[Both, str]:
     """The pairs of sessions that contradict each other, with the end of a sentence about them."""
     sessions = {name: m for name, m in sorted(maps.items()) if m.posed and not m.is_map}
     mountings = {name: _base_T_sensors(session) for name, session in sessions.items()}
@@ -82,7 +83,7 @@ def contradictions(maps: Mapping[str, SessionMap]) -> dict[frozenset[str], str]:
         if mountings[name] != mountings[other]  # most of many sessions have equal ones
     ]
     mounted = {name: Mounted.of(sessions[name]) for name in {name for p in pairs for name in p}}
-    texts = {frozenset(pair): contradiction(*(mounted[name] for name in pair)) for pair in pairs}
+    texts = {Both(pair): contradiction(*(mounted[name] for name in pair)) for pair in pairs}
     return {pair: text for pair, text in texts.items() if text}
 
 

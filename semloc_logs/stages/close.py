@@ -55,9 +55,11 @@ def close(
     search = PairSearch.of(work, settings, selection, overwrite=overwrite)
     keep(work, settings)
     searches = search.run(engine)
-    is_new = decide_all(work, search.maps, settings, search.searched(), overwrite=overwrite)
+    exclusions = search.exclusions
+    is_new = decide_all(
+        work, search.maps, settings, exclusions, search.searched(), overwrite=overwrite
+    )
     report = Report(closures=len(read_closures(work.closures)), amount=searches)
-    exclusions = Exclusions.of(search.maps, settings)
     report.skipped += exclusions.sentences()
     fitting = {name: m for name, m in search.maps.items() if name not in exclusions.misfits}
     report.skipped += same_recordings(fitting)
@@ -69,14 +71,15 @@ def decide_all(
     work: Workspace,
     maps: Maps,
     settings: Resolved,
+    exclusions: Exclusions,
     known: Mapping[Pair, str] | None = None,
     *,
     overwrite: bool = False,
 ) -> bool:
     """Write the tables of closures and rejections, and the picture; whether they were not there.
 
-    They are of the alignments of all pairs (``known``, where they are known already), without
-    sessions whose poses do not fit and pairs whose mountings contradict each other.
+    They are of the alignments of all pairs (``known``, where they are known already) but the
+    ``exclusions``.
     """
     known = known_pairs(work) if known is None else known
     if not overwrite and is_decided(work, settings, known):
@@ -84,7 +87,7 @@ def decide_all(
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
 
-    paths = _used_alignments(work, maps, settings, known)
+    paths = _alignment_tables(work, known, exclusions)
     searched = _searched(paths, maps, settings)
     decided = _decided(paths, maps, settings, searched)
     road = {name: session_map.distance for name, session_map in maps.items()}
@@ -105,7 +108,7 @@ def decide_all(
 
 def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> Outcomes:
     """What becomes of the alignments of all pairs that :func:`decide_all` uses."""
-    paths = _used_alignments(work, maps, settings, known_pairs(work))
+    paths = _alignment_tables(work, known_pairs(work), Exclusions.of(maps, settings))
     return _decided(paths, maps, settings, _searched(paths, maps, settings))
 
 
@@ -123,11 +126,10 @@ def _searched(pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> dict[str
     return {name: query_keyframes(maps[name], settings) for name in sessions}
 
 
-def _used_alignments(
-    work: Workspace, maps: Maps, settings: Resolved, known: Mapping[Pair, str]
+def _alignment_tables(
+    work: Workspace, known: Iterable[Pair], exclusions: Exclusions
 ) -> dict[Pair, Path]:
     """The tables of alignments of the pairs of sessions that may get closures."""
-    exclusions = Exclusions.of(maps, settings)
     return {
         pair: work.alignments(pair.query, pair.target)
         for pair in sorted(known)

@@ -69,7 +69,7 @@ class PairSearch:
 
     ``fingerprints`` are of what the alignments of every pair depend on, ``known`` of the
     alignments that are there. ``alone``: this process searches one pair, while others search
-    others.
+    others. ``exclusions``: pairs that are not searched.
     """
 
     work: Workspace
@@ -78,6 +78,7 @@ class PairSearch:
     fingerprints: Mapping[Pair, str]
     known: Mapping[Pair, str]
     chosen: Sequence[Pair]
+    exclusions: Exclusions
     alone: bool = False
 
     @classmethod
@@ -95,11 +96,11 @@ class PairSearch:
                 " all."
             )
         known = known_pair(work, pair)
-        is_excluded = Exclusions.of(maps, settings).has(pair)
-        is_missing = known.get(pair) != fingerprints[pair] and not is_excluded
+        exclusions = Exclusions.of(maps, settings)
+        is_missing = known.get(pair) != fingerprints[pair] and not exclusions.has(pair)
         chosen = [pair] if is_missing else []
         _check_words(work, chosen, maps, settings)
-        return cls(work, maps, settings, fingerprints, known, chosen, alone=True)
+        return cls(work, maps, settings, fingerprints, known, chosen, exclusions, alone=True)
 
     @classmethod
     def of(
@@ -126,7 +127,7 @@ class PairSearch:
             and (overwrite or known.get(pair) != fingerprint)
         ]
         _check_words(work, chosen, maps, settings)
-        return cls(work, maps, settings, fingerprints, known, chosen)
+        return cls(work, maps, settings, fingerprints, known, chosen, exclusions)
 
     def run(self, engine: Engine) -> int:
         """Search the pairs; how many searches of a query in a session that were.

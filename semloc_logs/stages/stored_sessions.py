@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import pyarrow.parquet as pq
 
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.session_pairs import forget, known_pairs
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
@@ -117,7 +118,8 @@ def _decide(work: Workspace) -> None:
     settings = read_kept(work)
     if settings is not None and work.closures.exists():
         maps = {folder.name: SessionMap(folder) for folder in work.sessions()}
-        decide_all(work, maps, settings.resolved())
+        resolved = settings.resolved()
+        decide_all(work, maps, resolved, Exclusions.of(maps, resolved))
 
 
 def _clear_targets(work: Workspace, name: str) -> None:

@@ -163,7 +163,7 @@ def _search(pair: Pair, work: Workspace, settings: Resolved, engine: Engine) -> 
         search = PairSearch.of_pair(work, settings, pair)
         keep(work, settings)
         search.run(engine)
-    report = Report(skipped=Exclusions.of(search.maps, settings).sentences())
+    report = Report(skipped=search.exclusions.sentences())
     (report.done if search.chosen else report.kept).append(f"search/{pair.query}/{pair.target}")
     return report
 

@@ -43,8 +43,8 @@ from semloc_logs.mapping.fit.findings import (
 )
 from semloc_logs.mapping.fit.keyframe_pairs import (
     Clouds,
-    Mounted,
     Registered,
+    SensorMounting,
     Start,
     choose,
     motion,
@@ -113,8 +113,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
             voxel,
             session.sweep_span_of(topic),
             session.time_offset_of(topic),
-            _mounted(session, {collected.headers[r].frame_id for r in rows}),
         )
+        clouds = replace(clouds, mounted=_mounted(session, clouds.frames()))
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         stream.frames = sorted(clouds.frames())
         add_evident_faults(stream, session, clouds)
@@ -126,11 +126,11 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     return check
 
 
-def _mounted(session: Session, frames: Set[str]) -> Mounted | None:
+def _mounted(session: Session, frames: Set[str]) -> SensorMounting | None:
     """The mounting of a stream that has one frame, and one pose of it in the base frame."""
     [frame, *others] = sorted(frames) or [""]
     base_T_sensor = session.fixed_mounting(frame)
-    return None if others or base_T_sensor is None else Mounted(frame, base_T_sensor)
+    return None if others or base_T_sensor is None else SensorMounting(frame, base_T_sensor)
 
 
 def compare(

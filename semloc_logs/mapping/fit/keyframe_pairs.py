@@ -57,7 +57,7 @@ Start = Callable[[int, int], F64]
 
 
 @dataclass(frozen=True, eq=False)
-class Mounted:
+class SensorMounting:
     """Where a sensor is all the time: ``base_T_sensor`` (4, 4) of its ``frame``."""
 
     frame: str
@@ -78,7 +78,7 @@ class Clouds:
     voxel: float
     span: float = 0.0
     time_offset: float = 0.0
-    mounted: Mounted | None = None
+    mounted: SensorMounting | None = None
 
     def stamps_ns(self) -> I64:
         """Their stamps (n,)."""

@@ -19,7 +19,7 @@ from semloc_logs.logs.poses.mountings import matrix
 from semloc_logs.mapping.fit.fault_texts import corrected
 from semloc_logs.mapping.fit.findings import SessionFit, Severity, StreamFit
 from semloc_logs.mapping.fit.fit_check import check_stream, explains_much
-from semloc_logs.mapping.fit.keyframe_pairs import Mounted
+from semloc_logs.mapping.fit.keyframe_pairs import SensorMounting
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Estimate, Fault
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.mapping.keyframes import Collected
@@ -160,7 +160,7 @@ def test_the_mounting_that_is_to_be_given_is_right(
     for folder in folders:
         folder.mkdir()
     clouds, track = streets.drive(folders[0], base_T_assumed=wrong)
-    clouds = replace(clouds, mounted=Mounted("lidar", assumed))
+    clouds = replace(clouds, mounted=SensorMounting("lidar", assumed))
     text = _only(check_stream(TOPIC, clouds, track.at_many))
     values = re.search(r"--set logs\.mountings\.lidar=\[(.*)\]$", text)
     assert values is not None, text
