@@ -310,13 +310,15 @@ class _Revisits:
                 out.trees[name] = cKDTree(out.positions[name][out.known[name]])
         return out
 
-    def is_near(self, name: str, keyframe: int, other: str) -> bool:
-        """Whether session ``other`` truly was where a keyframe of session ``name`` is."""
-        here = self.positions[name][keyframe]
+    def near(self, name: str, keyframes: I64, other: str) -> NDArray[np.bool_]:
+        """Whether session ``other`` truly was where each of ``keyframes`` (n,) of a session is."""
+        places = self.positions[name][keyframes]
         if self.heading_deg is None:
-            return bool(self.trees[other].query(here)[0] <= REVISIT_M)
-        neighbours = self.trees[other].query_ball_point(here, REVISIT_M)
-        return self.fits(name, keyframe, self.headings[other][self.known[other]][neighbours])
+            return np.asarray(self.trees[other].query(places)[0] <= REVISIT_M)
+        headings = self.headings[other][self.known[other]]
+        neighbours = self.trees[other].query_ball_point(places, REVISIT_M)
+        of_keyframes = zip(keyframes.tolist(), neighbours, strict=True)
+        return np.array([self.fits(name, k, headings[rows]) for k, rows in of_keyframes], bool)
 
     def fits(self, name: str, keyframe: int, headings: F64) -> bool:
         """Whether there are headings (n,), and all are at the angle to a keyframe."""
@@ -338,15 +340,12 @@ def _count_queries(
     counts = _Counts()
     for name in revisits.trees:
         session = sessions[name]
-        for k in query_keyframes(session, settings):
-            if not known[name][k]:
-                continue
-            counts.queries += 1
-            candidates = [
-                other
-                for other in revisits.trees
-                if other != name and revisits.is_near(name, k, other)
-            ]
+        keyframes = np.array(query_keyframes(session, settings), np.int64)
+        keyframes = keyframes[known[name][keyframes]]
+        is_visited = {o: revisits.near(name, keyframes, o) for o in revisits.trees if o != name}
+        counts.queries += len(keyframes)
+        for number, k in enumerate(keyframes.tolist()):
+            candidates = [other for other, visited in is_visited.items() if visited[number]]
             if self_closures and _revisits_itself(session, revisits, name, k, settings.closures):
                 candidates.append(name)
             if not candidates:

@@ -112,15 +112,18 @@ def interpolate(stamps_ns: NDArray[np.int64], poses: Array, at_ns: NDArray[np.in
     the nearest end; the caller decides what a gap is.
     """
     clipped = np.clip(np.asarray(at_ns, np.int64), stamps_ns[0], stamps_ns[-1])
-    if len(stamps_ns) == 1:
-        return np.repeat(poses, len(clipped), axis=0)
+    if len(stamps_ns) == 1 or not len(clipped):
+        return np.repeat(poses[:1], len(clipped), axis=0)
     # seconds from the first stamp: nanoseconds since 1970 do not fit float64
     base = np.asarray(stamps_ns[0], np.int64)
-    s = (stamps_ns - base) * 1e-9
-    a = (clipped - base) * 1e-9
+    wanted = (clipped - base) * 1e-9
+    # few poses of a long track cost no more than their neighbours
+    before = np.maximum(np.searchsorted(stamps_ns, clipped) - 1, 0)
+    rows = np.unique(np.r_[before, before + 1])
+    s = (stamps_ns[rows] - base) * 1e-9
     out = np.zeros((len(clipped), 4, 4))
-    out[:, :3, :3] = Slerp(s, Rotation.from_matrix(poses[:, :3, :3]))(a).as_matrix()
+    out[:, :3, :3] = Slerp(s, Rotation.from_matrix(poses[rows, :3, :3]))(wanted).as_matrix()
     for k in range(3):
-        out[:, k, 3] = np.interp(a, s, poses[:, k, 3])
+        out[:, k, 3] = np.interp(wanted, s, poses[rows, k, 3])
     out[:, 3, 3] = 1.0
     return out

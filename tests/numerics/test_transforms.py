@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics.transforms import (
     apply,
@@ -128,3 +129,15 @@ def test_interpolation_of_stamps_since_1970() -> None:
     np.testing.assert_allclose(
         interpolate(stamps[:1], poses[1:2], at), np.repeat(poses[1:2], len(at), 0)
     )
+
+
+def test_a_pose_of_a_long_track_is_the_same_alone_and_beside_others() -> None:
+    rng = np.random.default_rng(0)
+    stamps = 1_760_000_000_000_000_000 + np.cumsum(rng.integers(1, 1_000_000_000, 1000))
+    poses = np.tile(np.eye(4), (1000, 1, 1))
+    poses[:, :3, :3] = Rotation.random(1000, random_state=0).as_matrix()
+    poses[:, :3, 3] = rng.normal(0, 100, (1000, 3))
+    wanted = np.r_[rng.integers(stamps[0], stamps[-1], 50), stamps[[0, 1, 500, 999]]]
+    alone = np.concatenate([interpolate(stamps, poses, wanted[k : k + 1]) for k in range(54)])
+    np.testing.assert_array_equal(alone, interpolate(stamps, poses, wanted))
+    assert interpolate(stamps, poses, wanted[:0]).shape == (0, 4, 4)
