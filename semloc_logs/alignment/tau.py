@@ -158,7 +158,7 @@ def _closest_observed(
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")  # a call for each point takes 5 % longer
 def _closest_around(
     state: U8,
     cubes: U64,
