@@ -33,8 +33,14 @@ class Exclusions:
 
     def has(self, pair: Pair) -> bool:
         """Whether a pair gets no closures."""
-        both = Both((pair.query, pair.target))
-        return bool(self.misfits.keys() & both) or both in self.pairs
+        return bool(self.reason(pair.query, pair.target))
+
+    def reason(self, session: str, other: str) -> str:
+        """Why two sessions, or one and itself, get no closures; empty where they may."""
+        for name in (session, other):
+            if name in self.misfits:
+                return f"the poses of {name} do not fit"
+        return self.pairs.get(Both((session, other)), "")
 
     def sentences(self) -> list[str]:
         """A sentence for each session, and for each contradiction between some."""

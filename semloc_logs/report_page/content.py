@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import semloc_logs
 from semloc_logs.closures.closure import FEATURES, Agreement, Closure, Rejected
 from semloc_logs.closures.closure_tables import AGREEMENT_COLUMNS
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.pictures.placement import Placement, keyframe_near, pose_of
@@ -37,6 +38,7 @@ class Tables:
     """The tables of a workspace; ``outcomes`` are its alignments with what decided about them.
 
     ``refused`` are the closures that the optimised poses do not rest on, with the reason.
+    ``exclusions``: which sessions and pairs get no closures.
     """
 
     maps: Mapping[str, SessionMap]
@@ -45,6 +47,7 @@ class Tables:
     outcomes: Mapping[Key, Closure | Rejected]
     placement: Placement
     refused: Mapping[Key, str]
+    exclusions: Exclusions
 
 
 def key_of(row: Row) -> Key:
@@ -73,6 +76,8 @@ def content_of(work: Workspace, tables: Tables, settings: Mapping[str, Any]) -> 
         "optimised": [number[n] for n in names if n in tables.placement.optimised],
         "closures": _closures(tables, number),
         "rejected": _rejected(tables, number),
+        "excluded": _excluded(tables, names),
+        "exclusions": tables.exclusions.sentences(),
         "features": list(FEATURES),
         "votes": list(VOTES),
         "factors": list(FACTORS),
@@ -89,6 +94,17 @@ def content_of(work: Workspace, tables: Tables, settings: Mapping[str, Any]) -> 
 def _order(maps: Mapping[str, SessionMap]) -> list[str]:
     """Sessions by the time of their recording."""
     return sorted(maps, key=lambda name: (int(maps[name].stamps_ns[0]), name))
+
+
+def _excluded(tables: Tables, names: Sequence[str]) -> dict[str, str]:
+    """Why two sessions, or one and itself, get no closures, by their numbers as "0 1"."""
+    reasons = {}
+    for k, name in enumerate(names):
+        for m, other in enumerate(names[: k + 1]):
+            reason = tables.exclusions.reason(name, other)
+            if reason:
+                reasons[f"{m} {k}"] = reason
+    return reasons
 
 
 # -- sessions

@@ -106,9 +106,11 @@ def decide_all(
     return True
 
 
-def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> Outcomes:
+def decided_alignments(
+    work: Workspace, maps: Maps, settings: Resolved, exclusions: Exclusions
+) -> Outcomes:
     """What becomes of the alignments of all pairs that :func:`decide_all` uses."""
-    paths = _alignment_tables(work, known_pairs(work), Exclusions.of(maps, settings))
+    paths = _alignment_tables(work, known_pairs(work), exclusions)
     return _decided(paths, maps, settings, _searched(paths, maps, settings))
 
 

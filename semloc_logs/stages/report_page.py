@@ -10,6 +10,7 @@ import numpy as np
 
 from semloc_logs.closures.closure import Closure, Rejected
 from semloc_logs.closures.closure_tables import read_closures
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pictures.placement import Tie, place_sessions
@@ -37,8 +38,9 @@ def write_report(
     closures = read_closures(work.closures)
     rejected = read_closures(work.rejected)
     placement = place_sessions(work, maps, [Tie.of_row(row) for row in closures])
-    outcomes = _outcomes(work, maps, settings)
-    tables = Tables(maps, closures, rejected, outcomes, placement, _refused(work))
+    exclusions = Exclusions.of(maps, settings)
+    outcomes = _outcomes(work, maps, settings, exclusions)
+    tables = Tables(maps, closures, rejected, outcomes, placement, _refused(work), exclusions)
     content = content_of(work, tables, _settings_of(work))
     pictures = {} if slim else _pictures(work, content, tables)
     path = output or work.report
@@ -49,11 +51,11 @@ def write_report(
 
 
 def _outcomes(
-    work: Workspace, maps: dict[str, SessionMap], settings: Resolved
+    work: Workspace, maps: dict[str, SessionMap], settings: Resolved, exclusions: Exclusions
 ) -> dict[Key, Closure | Rejected]:
     """What was decided about each alignment, with its features and votes."""
     outcomes: dict[Key, Closure | Rejected] = {}
-    for outcome in decided_alignments(work, maps, settings):
+    for outcome in decided_alignments(work, maps, settings, exclusions):
         a = outcome.alignment
         key = (a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns)
         if key not in outcomes or isinstance(outcome, Closure):

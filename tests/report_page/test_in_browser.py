@@ -181,6 +181,15 @@ def test_a_cell_of_the_matrix_shows_its_closures(shown: Any) -> None:
     assert rejected > 0
 
 
+def test_a_pair_that_was_not_searched_has_a_cross_and_its_reason(shown: Any) -> None:
+    shown.run("data.excluded = {'0 3': 'the poses of tuesday do not fit'}")
+    shown.run("buildMatrix()")
+    cell = "document.querySelector('[data-cell=\"3\"]')"  # the other way has a hypothesis
+    assert shown.run(f"{cell}.textContent") == "×"
+    title = shown.run(f"{cell}.title")
+    assert title.endswith("not searched; the poses of tuesday do not fit")
+
+
 def test_the_list_is_sorted_and_turned(shown: Any) -> None:
     column = "[...document.querySelectorAll('#closure-table tbody tr')].map((r) => r.cells[9]"
     shown.run("document.querySelector('[aria-label=\"Sort by overlap\"]').click()")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.closures.closure import Closure, Reason, Rejected
+from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.report_page import closure_pictures, map_sheets
 from semloc_logs.report_page.map_sheets import MapSheet
@@ -21,7 +22,7 @@ from semloc_logs.settings import Settings
 from semloc_logs.stages import report_page
 from semloc_logs.stages.report_page import write_report
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import read_metadata, read_table, write_json, write_table
+from semloc_logs.tables.table import read_json, read_metadata, read_table, write_json, write_table
 from semloc_logs.workspace import Workspace
 
 
@@ -75,9 +76,24 @@ def test_an_alignment_that_was_found_twice_is_a_closure_if_either_is(
         ([first, last], first),
     ):
         monkeypatch.setattr(report_page, "decided_alignments", lambda *_, rows=decided: rows)
-        outcomes = report_page._outcomes(cast(Any, None), {}, Settings().resolved())
+        outcomes = report_page._outcomes(cast(Any, None), {}, Settings().resolved(), Exclusions())
         assert list(outcomes) == [("a", 1, "b", 2)]
         assert outcomes["a", 1, "b", 2] is expected
+
+
+def test_sessions_that_get_no_closures_say_why(tables: Workspace, tmp_path: Path) -> None:
+    work = Workspace(Path(shutil.copytree(tables.path, tmp_path / "work")))
+    jumping = work.sessions()[0]
+    fit = {"track": "its poses jump by 80 m", "streams": []}
+    write_json(jumping.session_json, {**read_json(jumping.session_json), "fit": fit})
+    data = data_of(write_report(work, Settings().resolved(), slim=True))
+    names = [session["name"] for session in data["sessions"]]
+    k = names.index(jumping.name)
+    reason = f"the poses of {jumping.name} do not fit"
+    pairs = [sorted((k, other)) for other in range(len(names))]
+    assert data["excluded"] == {f"{first} {second}": reason for first, second in pairs}
+    [sentence] = data["exclusions"]
+    assert "its poses jump by 80 m" in sentence
 
 
 def test_a_sheet_lies_where_its_map_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,9 +34,10 @@ function buildMatrix() {
       td.style.background = `rgb(var(--low) / ${(0.05 + 0.35 * data.rejected.probability[k]).toFixed(2)})`;
       td.title = `${names}: no closure; ${reasonText(data.rejected, k)}`;
     } else {
-      td.textContent = "-";
+      const reason = data.excluded[`${Math.min(q, t)} ${Math.max(q, t)}`];
+      td.textContent = reason ? "×" : "-";
       td.className = "none empty";
-      td.title = `${names}: no hypothesis`;
+      td.title = reason ? `${names}: not searched; ${reason}` : `${names}: no hypothesis`;
     }
     return td;
   };

@@ -122,7 +122,7 @@ function buildRun() {
   parts.push(el("div", {}, el("h3", {}, "Last run"),
     seconds.length ? facts(seconds.map(([stage, s]) => [stage, durationText(s)])) : el("p", {}, "semloc run has not written its timings here."),
     facts([["semloc", data.version], ["version of the run", data.run.version || "-"]])));
-  const left = [...(data.run.skipped || []), ...data.failed.map((f) => `${f.session}: ${f.reason}`)];
+  const left = [...new Set([...data.exclusions, ...(data.run.skipped || []), ...data.failed.map((f) => `${f.session}: ${f.reason}`)])];
   parts.push(el("div", {}, el("h3", {}, "Input that was left out"), left.length ? left.map((text) => el("p", { class: "warn" }, text)) : el("p", {}, "none")));
   const groups = Object.entries(data.settings).map(([section, values]) =>
     el("details", {}, el("summary", {}, section), facts(Object.entries(values).map(([key, value]) => [key, settingText(value)]))));
