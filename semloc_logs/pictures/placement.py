@@ -21,7 +21,7 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 GAP = 0.06  # between groups, over the width of the picture
-LEAST_GAP = 10.0  # metres
+LEAST_GAP = 240  # voxels: a map reaches about half as far beside its road
 ASPECT = 1.6  # of the picture: width over height
 MOST_COLUMNS = 40  # of groups
 
@@ -91,7 +91,8 @@ def place_sessions(
     placement.groups = _groups(maps, links, placement.optimised)
     for group in placement.groups:
         _place_group(placement, group, maps, links)
-    _lay_out(placement)
+    voxel = max((float(session.json["voxel_size"]) for session in maps.values()), default=0.0)
+    _lay_out(placement, LEAST_GAP * voxel)
     for session in maps.values():
         if not session.posed:
             _place_frames(placement, session, maps, ties)
@@ -277,8 +278,8 @@ def _place_frames(
 # -- groups beside each other
 
 
-def _lay_out(placement: Placement) -> None:
-    """Move the groups to the right of and below each other, so that none overlap."""
+def _lay_out(placement: Placement, least_gap: float) -> None:
+    """Move the groups to the right of and below each other, ``least_gap`` (m) apart at least."""
     boxes = []
     for group in placement.groups:
         places = np.concatenate([placement.common_T_base[name][:, :2, 3] for name in group])
@@ -286,7 +287,7 @@ def _lay_out(placement: Placement) -> None:
     if len(boxes) < 2:
         return
     sizes = np.array([high - low for low, high in boxes])
-    gap = max(LEAST_GAP, GAP * float(sizes.max()))
+    gap = max(least_gap, GAP * float(sizes.max()))
     most = np.cumsum(sizes[:, 0] + gap)
     layouts = [_rows(sizes, gap, float(width)) for width in most[:MOST_COLUMNS]]
     corners = min(layouts, key=lambda c: _extent(c, sizes))

@@ -27,6 +27,7 @@ class Drive(SessionMap):
         super().__init__(SessionFolder(Path(name)))
         self.map_T_base = poses
         self.stamps_ns = (np.arange(len(poses)) + start) * SECOND
+        self.json = {"voxel_size": 0.3}
         self._posed = posed
 
     @property
@@ -75,7 +76,7 @@ def test_a_chain_is_placed_through_the_sessions_between(tmp_path: Path) -> None:
     assert [placement.common_T_base[n][0, 0, 3] for n in "abc"] == pytest.approx([0, 1, 2])
 
 
-def test_groups_do_not_overlap(tmp_path: Path) -> None:
+def test_groups_lie_240_voxels_apart(tmp_path: Path) -> None:
     maps = {f"s{k}": Drive(f"s{k}", straight(5 + k), start=100 * k) for k in range(6)}
     placement = place_sessions(Workspace(tmp_path), maps, [])
     assert placement.groups == [[f"s{k}"] for k in range(6)]
@@ -83,7 +84,8 @@ def test_groups_do_not_overlap(tmp_path: Path) -> None:
     boxes = [(p.min(0), p.max(0)) for p in places]
     for k, (low, high) in enumerate(boxes):
         for other_low, other_high in boxes[k + 1 :]:
-            assert (high < other_low).any() or (other_high < low).any()
+            gaps = np.maximum(other_low - high, low - other_high)
+            assert gaps.max() >= 240 * 0.3 - 1e-9
 
 
 def test_optimised_poses_are_used_and_the_others_are_laid_on_them(tmp_path: Path) -> None:
