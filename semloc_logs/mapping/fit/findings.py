@@ -53,7 +53,8 @@ class StreamFit:
     ``pairs`` were registered; poses and clouds differ by ``translation_m`` and ``rotation_rad`` in
     the median. ``parameters`` are (estimate, standard deviation) by name; ``hidden`` are the faults
     that the drive would not show: a straight one hides a lever arm, a steady one a clock offset.
-    ``drift`` of the poses, where the clouds show it. ``frames``: of the sensor.
+    ``drift`` of the poses, where the clouds show it. ``frames``: of the sensor. ``is_doubtful``: a
+    fault explains almost enough.
     """
 
     topic: str
@@ -65,6 +66,7 @@ class StreamFit:
     hidden: list[str] = field(default_factory=list)
     drift: Drift | None = None
     frames: Sequence[str] = ()
+    is_doubtful: bool = False
 
     @property
     def is_wrong(self) -> bool:

@@ -8,7 +8,7 @@ each that explains much is named with its estimate.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,8 @@ I64 = NDArray[np.int64]
 # pairs of a stream: one for so many keyframes, within these bounds; a pair costs about 15 ms
 KEYFRAMES_A_PAIR = 8
 FEWEST_PAIRS, MOST_PAIRS = 24, 400
+# where a fault explains half of what it has to, three times as many pairs tell
+ALMOST, MORE_PAIRS = 0.5, 3
 # a hypothesis explains much: it lowers half of chi squared by :data:`LEAST_GAIN`, and its parameter
 # differs from zero by :data:`LEAST_SIGMAS`
 AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
@@ -163,8 +165,25 @@ def check_stream(
 
     ``are_fixes``: the poses are fixes of a receiver, whose scatter is noted but not refused.
     """
-    count = len(clouds.rows) // KEYFRAMES_A_PAIR
-    numbers = choose(clouds, min(max(count, FEWEST_PAIRS), MOST_PAIRS))
+    count = min(max(len(clouds.rows) // KEYFRAMES_A_PAIR, FEWEST_PAIRS), MOST_PAIRS)
+    numbers = choose(clouds, count)
+    bad_fit = Severity.NOTED if are_fixes else Severity.WRONG
+    stream = _checked(topic, clouds, poses_at, numbers, bad_fit)
+    if stream.is_doubtful and not stream.findings:
+        more = choose(clouds, MORE_PAIRS * count)
+        if len(more) > len(numbers):
+            return _checked(topic, clouds, poses_at, more, bad_fit)
+    return stream
+
+
+def _checked(
+    topic: str,
+    clouds: Clouds,
+    poses_at: PosesAt,
+    numbers: Sequence[tuple[int, int]],
+    bad_fit: Severity,
+) -> StreamFit:
+    """The check of chosen pairs; ``bad_fit``: of poses that contradict clouds without a fault."""
     given = registered(clouds, numbers)
     if stream := _in_other_unit(topic, clouds, poses_at, given):
         return stream
@@ -172,17 +191,18 @@ def check_stream(
         return _far_off(topic, clouds, poses_at, numbers, given)
     given = searched(clouds, given)
     others = [registered(clouds, numbers, start) for start in _starts(clouds, poses_at, given)]
+    is_doubtful = False
     for registration in sorted(others, key=_share, reverse=True):
         stream = _judged(topic, clouds, poses_at, registration)
         if stream.findings:
             return stream
+        is_doubtful |= stream.is_doubtful
     stream = _judged(topic, clouds, poses_at, given)
+    stream.is_doubtful |= is_doubtful
     # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
     if not stream.findings and not clouds.sees_one_side():
         best = max([given, *others], key=_share)
-        add_contradictions(
-            stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
-        )
+        add_contradictions(stream, best, poses_at, clouds, bad_fit)
         if not stream.findings:
             add_strangers(stream, clouds, numbers, given)
     elif not stream.findings:
@@ -267,15 +287,18 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, registration: Registe
     if reading := far_reading(pairs, poses_at, none.squares, clouds):
         stream.findings.append(Finding(Severity.WRONG, reading))
         return stream
-    estimate, faults = _explained(pairs, poses_at, none)
-    if faults:
+    explanation = _explained(pairs, poses_at, none)
+    if explanation.faults:
         # a registration from there ends at the right motion where others did not
         refined = registered(
-            clouds, registration.numbers.tolist(), _start(clouds, poses_at, estimate)
+            clouds, registration.numbers.tolist(), _start(clouds, poses_at, explanation.estimate)
         )
         pairs = refined.pairs
         none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
-        estimate, faults = _explained(pairs, poses_at, none)
+        explanation = _explained(pairs, poses_at, none)
+    estimate = explanation.estimate
+    faults = explanation.faults
+    stream.is_doubtful = explanation.is_doubtful
     if reading := near_reading(pairs, poses_at, none.cost, estimate.cost):
         stream.findings.append(Finding(Severity.WRONG, reading))
         return stream
@@ -304,23 +327,36 @@ def _start(clouds: Clouds, poses_at: PosesAt, estimate: Estimate) -> Start:
     return start
 
 
-def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimate, list[Fault]]:
-    """The estimate with every fault that explains much, the one that explains most first."""
+@dataclass(frozen=True, slots=True)
+class _Explanation:
+    """The estimate with every fault that explains enough, the one that explains most first.
+
+    ``is_doubtful``: one more almost does.
+    """
+
+    estimate: Estimate
+    faults: list[Fault]
+    is_doubtful: bool
+
+
+def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> _Explanation:
     estimate = none
     faults: list[Fault] = []
+    explained = 0.0
     possible = [f for f in Fault if f is not Fault.SCALE or agree_about_scale(pairs, poses_at)]
     while len(faults) < len(possible):
         tries = {f: _with(pairs, poses_at, estimate, f) for f in possible if f not in faults}
         fault, better = min(tries.items(), key=lambda item: item[1].cost)
-        if not explains_much(fault, estimate, better):
+        explained = explained_share(fault, estimate, better)
+        if explained < 1.0:
             break
         estimate = better
         faults.append(fault)
-    return estimate, faults
+    return _Explanation(estimate, faults, ALMOST <= explained < 1.0)
 
 
-def explains_much(fault: Fault, before: Estimate, after: Estimate) -> bool:
-    """Whether one more ``fault`` lowers the cost by much.
+def explained_share(fault: Fault, before: Estimate, after: Estimate) -> float:
+    """By how much one more ``fault`` lowers the cost, as a share of what it has to; 1 is enough.
 
     Beside the noise that pairs are expected to have; or beside the noise that they show, where the
     cost falls as the parameters and their standard deviations have it. A dip of the cost far off
@@ -329,14 +365,13 @@ def explains_much(fault: Fault, before: Estimate, after: Estimate) -> bool:
     gain = before.cost - after.cost
     shown = scatter(after.squares)
     least = LEAST_GAIN + len(fault.columns)
-    if gain / max(1.0, shown) >= least:
-        return True
     sigmas = [
         (after.parameters[column] - before.parameters[column]) / max(after.sigma(column), 1e-9)
         for column in fault.columns.tolist()
     ]
     expected = 0.5 * float(np.square(sigmas).sum())
-    return gain / shown >= max(least, expected / AS_EXPECTED)
+    beside_expected = gain / max(1.0, shown) / least
+    return max(beside_expected, gain / shown / max(least, expected / AS_EXPECTED))
 
 
 def _with(pairs: Pairs, poses_at: PosesAt, estimate: Estimate, fault: Fault) -> Estimate:

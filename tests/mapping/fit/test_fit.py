@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.logs.poses.mountings import matrix
+from semloc_logs.mapping.fit import fit_check
 from semloc_logs.mapping.fit.fault_texts import corrected
 from semloc_logs.mapping.fit.findings import SessionFit, Severity, StreamFit
-from semloc_logs.mapping.fit.fit_check import check_stream, explains_much
+from semloc_logs.mapping.fit.fit_check import check_stream, explained_share
 from semloc_logs.mapping.fit.keyframe_pairs import SensorMounting
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Estimate, Fault
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
@@ -221,16 +222,16 @@ def test_rotations_and_positions_of_different_times_are_named(
 
 
 @pytest.mark.parametrize(
-    ("gain", "sigma", "is_much"),
+    ("gain", "sigma", "share"),
     [
-        (14.0, 0.001, True),  # much beside the noise that is expected
-        (8.0, 0.05, True),  # 0.5 * 4 ** 2 = 8: as the standard deviation has it, at a tenth of it
-        (2.0, 0.1, False),  # 2 sigma
-        (8.0, 0.002, False),  # a dip 100 standard deviations off: as if the cost fell by 5000
+        (14.0, 0.001, 14 / 13),  # much beside the noise that is expected
+        (8.0, 0.05, 40 / 13),  # 0.5 * 4 ** 2 = 8: as the standard deviation has it, at a fifth
+        (2.0, 0.1, 10 / 13),  # 2 sigma
+        (8.0, 0.002, 8 / 13),  # a dip 100 standard deviations off: as if the cost fell by 5000
     ],
 )
 def test_a_small_gain_counts_where_the_cost_falls_as_expected(
-    gain: float, sigma: float, is_much: bool
+    gain: float, sigma: float, share: float
 ) -> None:
     """Of 24 pairs with a tenth of the expected scatter: (3 + 24 x 0.1) / (3 + 24) = 0.2."""
     covariance = np.zeros((8, 8))
@@ -239,7 +240,23 @@ def test_a_small_gain_counts_where_the_cost_falls_as_expected(
     before = Estimate(np.zeros(8), np.zeros(0, np.int64), np.zeros((8, 8)), 20.0, squares)
     offset = np.array([0.2, *[0.0] * 7])
     after = Estimate(offset, Fault.CLOCK.columns, covariance, 20.0 - gain, squares)
-    assert explains_much(Fault.CLOCK, before, after) == is_much
+    assert explained_share(Fault.CLOCK, before, after) == pytest.approx(share)
+
+
+def test_what_few_pairs_almost_explain_more_pairs_decide(
+    check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_check, "FEWEST_PAIRS", 8)
+    monkeypatch.setattr(fit_check, "MORE_PAIRS", 1)
+    few = check(is_camera=True, clock=0.04)
+    assert (few.pairs, few.is_doubtful, few.findings) == (8, True, [])
+    monkeypatch.setattr(fit_check, "MORE_PAIRS", 3)
+    more = check(is_camera=True, clock=0.04)
+    assert more.pairs == 24
+    [finding] = more.findings
+    assert "its stamps are 0.04" in finding.text
+    # without a doubt there are no more
+    assert check(is_camera=True).pairs == 8
 
 
 def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
