@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from semloc_logs.closures.acceptance import decide
 from semloc_logs.closures.acceptance.calibration import Calibration, Model, shipped
 from semloc_logs.closures.acceptance.decide import weakest, why_rejected
 from semloc_logs.closures.closure import (
@@ -174,3 +177,38 @@ def test_every_reason_has_a_sentence() -> None:
     sentences = [sentence(reason, decision(0.5)) for reason in Reason]
     assert len(set(sentences)) == len(Reason)
     assert not any("{" in text for text in sentences)
+
+
+def test_what_has_just_the_required_probability_passes() -> None:
+    at_bound = dataclasses.replace(
+        decision(0.9999, vetoes=frozenset({Veto.LOOSE_FIT})), min_probability=0.9999
+    )
+    assert why(at_bound) is Reason.LOOSE_FIT
+    place = dataclasses.replace(decision(0.99, confidence=0.5), min_probability=0.99)
+    assert why(place) is Reason.UNCERTAIN_POSITION
+    neighbours = dataclasses.replace(SURE, own_probability=0.99)
+    assert why(decision(0.5), neighbours) is Reason.NEIGHBOURS_CONFLICT
+
+
+def test_each_query_has_one_first_alignment_in_each_target() -> None:
+    class Rows:
+        pair = np.array([2, 0, 0, 2])
+        query_keyframe = np.array([0, 1, 1, 0])
+
+        def __len__(self) -> int:
+            return 4
+
+    first = decide._is_first(cast(Any, Rows()), np.array([3, 2, 0, 1]))
+    np.testing.assert_array_equal(first, [False, False, True, True])
+
+
+def test_alignments_are_ordered_by_query_then_probability_then_structure() -> None:
+    rows = SimpleNamespace(
+        pairs=[("b", "a"), ("a", "b")],
+        pair=np.array([0, 0, 1, 0]),
+        query_stamp_ns=np.array([10, 10, 50, 10]),
+        target_stamp_ns=np.ones(4, int),
+        features=SimpleNamespace(structure=np.array([0.3, 0.6, 0.1, 0.9])),
+    )
+    order = decide._order(cast(Any, rows), np.array([0.5, 0.5, 0.2, 0.4]))
+    np.testing.assert_array_equal(order, [2, 1, 0, 3])
