@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from semloc_logs.closures.acceptance import ambiguity as ambiguity_module
-from semloc_logs.closures.acceptance.ambiguity import _about, _nearest, ambiguity
+from semloc_logs.closures.acceptance.ambiguity import (
+    _about,
+    _contradictions,
+    _nearest,
+    ambiguity,
+)
 from semloc_logs.closures.acceptance.placements import Placed
 
 
@@ -65,3 +70,26 @@ def test_a_contradiction_with_a_lone_query_is_not_counted_along_the_road(
     roads = {name: np.array([50.0]) for name in "abc"}
     found = ambiguity(rows, {}, roads, np.zeros(3), np.array(lone), 0.3)
     assert found.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("voxel_size", "metres_off", "road_between", "contradicts"),
+    [
+        (0.3, 19.9, 0.0, False),  # 20 m at street voxels
+        (0.3, 20.1, 0.0, True),
+        (0.05, 3.3, 0.0, False),  # a sixth of it at a sixth of the voxel
+        (0.05, 3.4, 0.0, True),
+        (0.05, 99.0, 33.0, True),  # odometry ties a sixth of 200 m together
+        (0.05, 99.0, 34.0, False),
+    ],
+)
+def test_three_alignments_contradict_each_other_by_metres_at_the_scale_of_the_voxels(
+    voxel_size: float, metres_off: float, road_between: float, contradicts: bool
+) -> None:
+    """a in b and b in c put a at the origin of c, a in c puts it elsewhere."""
+    rows = placed(["a", "a", "b"], ["b", "c", "c"], 0.0)
+    rows.target_T_query[1, 0, 3] = metres_off
+    rows.road[1] += road_between
+    pairs = {("a", "b"): np.array([0]), ("a", "c"): np.array([1]), ("b", "c"): np.array([2])}
+    triples = _contradictions(rows, pairs, np.ones(3), voxel_size)
+    assert triples.tolist() == ([[0, 1, 2]] if contradicts else [])

@@ -1,6 +1,4 @@
-"""Which frame is the base, where sensors are mounted in it, and what is assumed where a log does
-not say.
-"""
+"""The base frame and mountings of sensors, also where a log has none."""
 
 from __future__ import annotations
 
