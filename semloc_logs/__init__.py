@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from semloc_logs.api import Closure, Closures, Session, Workspace, evaluate, open_log
+    from semloc_logs.errors import SemlocError
     from semloc_logs.settings import Settings
 
 __all__ = [
     "Closure",
     "Closures",
+    "SemlocError",
     "Session",
     "Settings",
     "Workspace",
@@ -39,6 +41,8 @@ def __getattr__(name: str) -> Any:
     """The public names, loaded when they are first used: importing the package is cheap."""
     if name == "Settings":
         return import_module("semloc_logs.settings").Settings
+    if name == "SemlocError":
+        return import_module("semloc_logs.errors").SemlocError
     if name in __all__:
         return getattr(import_module("semloc_logs.api"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

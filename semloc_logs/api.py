@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 import pyarrow as pa
@@ -84,7 +84,13 @@ class Closures(Sequence[Closure]):
     def __len__(self) -> int:
         return int(self._table.num_rows)
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> Closure: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Closure]: ...
+
+    def __getitem__(self, index: int | slice) -> Closure | list[Closure]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         row = self._table.slice(range(len(self))[index], 1).to_pylist()[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -48,7 +49,8 @@ MIN_RELATIVE_SCORE = 0.8
 MIN_SCORE = 0.25
 
 Prepared = tuple[Described, list[list[LookUp]]]
-_PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
+# of each query by what its words depend on
+_PREPARED: WeakKeyDictionary[Query, dict[tuple[Any, ...], Prepared]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,16 +213,17 @@ def turned_matches(quarters: Sequence[Matches]) -> Matches:
 def prepare(query: Query, variant: str, ground_z: float, settings: Resolved) -> Prepared:
     """The subvolumes of a query and their look-ups in each quarter turn, once for all targets."""
     of_query = _PREPARED.setdefault(query, {})
-    if variant not in of_query:
+    probes = settings.closures.probes
+    key = (variant, ground_z, settings.descriptor, settings.fusion.voxel_size, probes)
+    if key not in of_query:
         described = _describe(query, variant, ground_z, settings)
         turned = (quarter_turns(described.descriptor, turns) for turns in range(4))
         vocabulary = load_vocabulary(variant, settings.descriptor.vocabulary)
-        probes = settings.closures.probes
-        of_query[variant] = (
+        of_query[key] = (
             described,
             [look_ups(vocabulary, descriptors, probes) for descriptors in turned],
         )
-    return of_query[variant]
+    return of_query[key]
 
 
 def _describe(query: Query, variant: str, ground_z: float, settings: Resolved) -> Described:

@@ -92,11 +92,11 @@ class Evaluation:
     queries, None without possible ones. ``pairs``: of those that have closures or could have.
     """
 
-    rows: list[Judged]
+    rows: list[Judged] = field(repr=False)
     queries: int
     possible: int
     answered: int
-    pairs: list[PairFigures] = field(default_factory=list)
+    pairs: list[PairFigures] = field(default_factory=list, repr=False)
 
     @property
     def closures(self) -> int:
@@ -423,6 +423,8 @@ def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, True
     """The true tracks of those ``sessions`` that the file knows. Raises TruthError when it is
     missing or wrong, or knows none.
     """
+    if not path.exists():
+        raise TruthError(f"Truth file {path} does not exist.")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:

@@ -53,7 +53,7 @@ class Level:
         return self.gravity.problems
 
 
-def level(session: Session, collected: Collected, fusion: Resolved) -> Level:
+def level(session: Session, collected: Collected, settings: Resolved) -> Level:
     """The level map frame of a session; its origin is the first keyframe.
 
     Poses may be in UTM, and voxels, words and surfaces want small numbers. In a log without poses
@@ -62,14 +62,14 @@ def level(session: Session, collected: Collected, fusion: Resolved) -> Level:
     known = np.array([p for p in collected.poses if p is not None]).reshape(-1, 4, 4)
     places = collected.flat_places()
     expected = _expected(session, known)
-    gravity = _gravity(expected, places, known, fusion)
+    gravity = _gravity(expected, places, known, settings)
     if not len(known):
         return Level(np.eye(4), _each_level(len(collected), places, gravity), gravity)
     session_T_map = np.eye(4)
     session_T_map[:3, :3] = rotation_between(UP, gravity.up)
     session_T_map[:3, 3] = known[0][:3, 3]
     is_mounted = any(frame_name(h.frame_id) != session.base_frame for h in collected.headers)
-    way = straight_way(known[:, :3, 3], fusion.fusion.voxel_size) if is_mounted else None
+    way = straight_way(known[:, :3, 3], settings.fusion.voxel_size) if is_mounted else None
     tilt = 0.0 if way is None else _tilt(expected, gravity, places, way)
     return Level(session_T_map, inverse(session_T_map) @ known, gravity, tilt)
 

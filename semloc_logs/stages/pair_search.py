@@ -130,12 +130,10 @@ class PairSearch:
         return cls(work, maps, settings, fingerprints, known, chosen, exclusions)
 
     def run(self, engine: Engine) -> int:
-        """Search the pairs; how many searches of a query in a session that were.
+        """Search the pairs, and return the number of searches of one query in one session.
 
-        Each session that is done gets its tables of alignments.
-
-        A session whose search was interrupted goes on where it was. Alignments that belong to no
-        present pair are removed.
+        Each session that is done gets its tables of alignments. A session whose search was
+        interrupted goes on where it was. Alignments that belong to no present pair are removed.
         """
         for pair in self.chosen:
             if self.known.get(pair) == self.fingerprints[pair]:  # to be overwritten

@@ -18,6 +18,7 @@ from semloc_logs.closures.matching import (
     QueryContext,
     _each_place_once,
     find_hypotheses,
+    prepare,
     verify_hypotheses,
 )
 from semloc_logs.numerics.transforms import yaw_transform
@@ -53,6 +54,34 @@ def fitted(x: float, score: float) -> Fitted:
 def test_the_best_fit_of_each_place_is_kept() -> None:
     rows = [fitted(0.5, 0.4), fitted(0.0, 0.6), fitted(9.0, 0.5)]
     assert [f.scores.forward.aligned for f in _each_place_once(rows, 0.3)] == [60, 50]
+
+
+def test_the_words_of_a_query_are_made_once_for_what_they_depend_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[tuple[str, float]] = []
+
+    def describe(query: Any, variant: str, ground_z: float, settings: Resolved) -> Any:
+        made.append((variant, ground_z))
+        return SimpleNamespace(descriptor=np.zeros((0, 8), np.float32))
+
+    monkeypatch.setattr(matching, "_describe", describe)
+    monkeypatch.setattr(matching, "quarter_turns", lambda descriptors, turns: descriptors)
+    monkeypatch.setattr(matching, "load_vocabulary", lambda variant, path: None)
+    monkeypatch.setattr(matching, "look_ups", lambda vocabulary, descriptors, probes: [probes])
+    few, many = settings(probes=1), settings(probes=3)
+
+    class Query:
+        pass
+
+    query = cast(Any, Query())
+    with_few = prepare(query, "semantic", 0.5, few)
+    with_many = prepare(query, "semantic", 0.5, many)
+    assert prepare(query, "semantic", 0.5, few) is with_few
+    assert (cast(Any, with_few[1]), cast(Any, with_many[1])) == ([[1]] * 4, [[3]] * 4)
+    prepare(query, "semantic", 0.7, few)
+    prepare(query, "geometric", 0.5, few)
+    assert made == [("semantic", 0.5)] * 2 + [("semantic", 0.7), ("geometric", 0.5)]
 
 
 def test_candidates_of_each_session_are_as_many_as_the_settings_name(

@@ -269,6 +269,13 @@ def test_wrong_truth_files_are_refused(work: Workspace, content: str) -> None:
         _evaluate(work)
 
 
+def test_a_truth_file_that_is_missing_is_named(work: Workspace) -> None:
+    (work.path.parent / "truth.json").unlink(missing_ok=True)
+    _closures(work, [])
+    with pytest.raises(TruthError, match=r"truth.json does not exist"):
+        _evaluate(work)
+
+
 def test_a_matrix_that_is_no_pose_is_refused(work: Workspace) -> None:
     (work.path.parent / "truth.json").write_text(
         json.dumps({"a": {"T_common_session": (2 * np.eye(4)).tolist()}})

@@ -133,6 +133,11 @@ def test_closures_are_annotated_and_judged(
     assert (result.correct, result.false) == (len(work.closures()), 0)
 
 
+def test_an_expected_error_is_of_one_kind(tmp_path: Path) -> None:
+    with pytest.raises(semloc.SemlocError, match="no session"):
+        semloc.Workspace(tmp_path / "new")["monday"]
+
+
 def test_importing_the_package_is_cheap() -> None:
     code = (
         "import sys, semloc_logs; print(sorted({'torch', 'numpy', 'pyarrow'} & set(sys.modules)))"

@@ -84,11 +84,10 @@ KEYFRAMES_A_PAIR = 8
 FEWEST_PAIRS, MOST_PAIRS = 24, 400
 # where a fault explains half of what it has to, three times as many pairs tell
 ALMOST, MORE_PAIRS = 0.5, 3
-# a hypothesis explains much: it lowers half of chi squared by :data:`LEAST_GAIN`, and its parameter
-# differs from zero by :data:`LEAST_SIGMAS`
-AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
-# squared distances in the median beyond which other starts of registration are tried; and up to
-# which faults explain the pairs, more with noisy registrations
+# a fault is trusted where the cost falls by a third of what its parameters and their standard
+# deviations let expect
+AS_EXPECTED = 3.0
+# median of the squared distances beyond which registration is tried from other starts
 DOUBTFUL = 15.0
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
