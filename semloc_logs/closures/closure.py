@@ -193,7 +193,8 @@ class Alignments(Rows[Alignment]):
         def column(name: str) -> NDArray[Any]:
             return np.concatenate([getattr(part, name) for part in held])
 
-        columns: dict[str, Any] = {f.name: column(f.name) for f in fields(cls)[2:-2]}
+        names = {f.name for f in fields(cls)} - {"pairs", "pair", "features", "given"}
+        columns: dict[str, Any] = {name: column(name) for name in names}
         features = (
             np.concatenate([getattr(part.features, name) for part in held]) for name in FEATURES
         )
