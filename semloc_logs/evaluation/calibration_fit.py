@@ -45,6 +45,8 @@ AGAINST = 2.0
 # how much streets look like others by chance, in however few towns it was not seen
 BY_CHANCE = 0.01
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
+# more is never allowed: a city of copies that no fit has seen had wrong alignments at 0.023
+MOST_AMBIGUOUS = 0.02
 
 
 def fit_signed(
@@ -115,7 +117,8 @@ def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
 
     The geometric mean of right ones of the ordinary town that has the most of it, and of wrong ones
     of the city of copies that has the least: as many times the one as the other is it. An ordinary
-    town whose streets look like others as much as copies do is given up where they do.
+    town whose streets look like others as much as copies do is given up where they do. It is
+    :data:`MOST_AMBIGUOUS` at most.
     """
     taken = (p >= SURE) & (agreement.neighbours > 0)
     right = taken & judged.right & ~judged.copies
@@ -130,8 +133,9 @@ def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
     ]
     least = [share for share in least if share > 0]  # else nothing there could show it
     if not least:
-        return 1.0
-    return float(np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least)))
+        return MOST_AMBIGUOUS
+    between = np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least))
+    return min(float(between), MOST_AMBIGUOUS)
 
 
 def agreement_of(judged: Judged, own: F64) -> Agreement[F64]:
