@@ -37,8 +37,8 @@ def room(rng: np.random.Generator, n: int, noise: float = 0.01, corridor: bool =
     return points + rng.normal(0, noise, points.shape)
 
 
-def error(found: F64, truth: F64) -> tuple[float, float]:
-    d = inverse(truth) @ found
+def error(estimate: F64, truth: F64) -> tuple[float, float]:
+    d = inverse(truth) @ estimate
     return float(np.linalg.norm(d[:3, 3])), rotation_angle(d[:3, :3])
 
 

@@ -27,13 +27,13 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
     rng = np.random.default_rng(4)
     for corridor in (False, True):
         target = surface_of(room(rng, 1500, corridor=corridor), CELL)
-        found = align(
+        fitted = align(
             room(rng, 700, corridor=corridor)[:, :3],
             target,
             SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)),
             STEPS,
         )
-        C = covariance_of(found, np.eye(4), np.eye(4), 0.3)
+        C = covariance_of(fitted, np.eye(4), np.eye(4), 0.3)
         assert np.linalg.eigvalsh(C).min() > 0
         np.testing.assert_allclose(C, C.T)
         values, vectors = np.linalg.eigh(C[:3, :3])
@@ -47,13 +47,13 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
 
 def test_covariance_says_what_is_not_known() -> None:
     rng = np.random.default_rng(4)
-    found = align(
+    fitted = align(
         room(rng, 700, corridor=True),
         surface_of(room(rng, 1500, corridor=True), CELL),
         np.eye(4),
         STEPS,
     )
-    assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
+    assert covariance_of(fitted, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
 
 
 def held(
@@ -130,11 +130,11 @@ def test_too_little_rmse_is_not_believed() -> None:
 def test_covariance_of_position_and_angles_turns_with_the_target(yaw: float) -> None:
     """A target that looks along ``yaw`` has R^T C R, not R C R^T, and of angles too."""
     half = np.random.default_rng(3).normal(size=(6, 6)) * 30
-    found = held(half @ half.T, half[:2] / 10, centre=(1.0, -2.0, 0.5))
+    fitted = held(half @ half.T, half[:2] / 10, centre=(1.0, -2.0, 0.5))
     query = yaw_transform(0.3, (2.0, 1.0, 0.0))
-    at = (5.0, 3.0, 1.0)
-    C = covariance_of(found, query, yaw_transform(0.0, at), 0.3)
-    turned = covariance_of(found, query, yaw_transform(yaw, at), 0.3)
+    position = (5.0, 3.0, 1.0)
+    C = covariance_of(fitted, query, yaw_transform(0.0, position), 0.3)
+    turned = covariance_of(fitted, query, yaw_transform(yaw, position), 0.3)
     R = np.kron(np.eye(2), yaw_transform(yaw)[:3, :3])
     np.testing.assert_allclose(turned, R.T @ C @ R, rtol=1e-9, atol=1e-15)
     assert np.abs(turned - R @ C @ R.T).max() > 1e-3 * np.abs(C).max()
@@ -148,7 +148,7 @@ def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float
     moved by a Jacobian of finite differences.
     """
     half = np.random.default_rng(4).normal(size=(6, 6)) * 30
-    found = held(half @ half.T)
+    fitted = held(half @ half.T)
     here = yaw_transform(0.0, arm)
     J = np.eye(6)
     for k in range(3):
@@ -156,22 +156,22 @@ def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float
             apply(exp_se3(np.zeros(3), 1e-6 * np.eye(3)[k]), np.array([arm]))[0] - arm
         ) / 1e-6
     floor = np.diag([1e-4] * 3 + [1e-6] * 3)
-    C = covariance_of(found, np.eye(4), np.eye(4), 0.3) - floor
+    C = covariance_of(fitted, np.eye(4), np.eye(4), 0.3) - floor
     np.testing.assert_allclose(
-        covariance_of(found, here, here, 0.3), J @ C @ J.T + floor, rtol=1e-4, atol=1e-9
+        covariance_of(fitted, here, here, 0.3), J @ C @ J.T + floor, rtol=1e-4, atol=1e-9
     )
 
 
 def test_covariance_lies_in_the_axes_of_the_target() -> None:
     """A corridor along the map's x is one along -y for a target that looks along the map's y."""
     rng = np.random.default_rng(5)
-    found = align(
+    fitted = align(
         room(rng, 700, corridor=True),
         surface_of(room(rng, 1500, corridor=True), CELL),
         np.eye(4),
         STEPS,
     )
-    C = covariance_of(found, np.eye(4), yaw_transform(np.pi / 2, (3.0, 2.0, 0.0)), 0.3)
+    C = covariance_of(fitted, np.eye(4), yaw_transform(np.pi / 2, (3.0, 2.0, 0.0)), 0.3)
     assert abs(np.linalg.eigh(C[:3, :3])[1][1, -1]) > 0.99
 
 
@@ -180,15 +180,15 @@ def test_covariance_grows_with_the_lever_arm() -> None:
     angle times the distance.
     """
     rng = np.random.default_rng(6)
-    found = align(room(rng, 700), surface_of(room(rng, 1500), CELL), np.eye(4), STEPS)
-    near = covariance_of(found, np.eye(4), np.eye(4), 0.3)
-    far = covariance_of(found, yaw_transform(0.0, (100.0, 0.0, 0.0)), np.eye(4), 0.3)
-    np.testing.assert_allclose(far[3:, 3:], near[3:, 3:])
-    centre = found.centre[0]
-    expected = near[1, 1] + ((100 - centre) ** 2 - centre**2) * (near[5, 5] - 1e-6)
+    fitted = align(room(rng, 700), surface_of(room(rng, 1500), CELL), np.eye(4), STEPS)
+    at_origin = covariance_of(fitted, np.eye(4), np.eye(4), 0.3)
+    far = covariance_of(fitted, yaw_transform(0.0, (100.0, 0.0, 0.0)), np.eye(4), 0.3)
+    np.testing.assert_allclose(far[3:, 3:], at_origin[3:, 3:])
+    centre = fitted.centre[0]
+    expected = at_origin[1, 1] + ((100 - centre) ** 2 - centre**2) * (at_origin[5, 5] - 1e-6)
     assert far[1, 1] == pytest.approx(expected, rel=0.05)
     # the distance alone adds nothing along the arm
-    assert far[0, 0] < 2 * near[0, 0] + 1e-6
+    assert far[0, 0] < 2 * at_origin[0, 0] + 1e-6
 
 
 def test_errors_of_many_fits_stay_within_the_covariance() -> None:
@@ -197,11 +197,11 @@ def test_errors_of_many_fits_stay_within_the_covariance() -> None:
     """
     squared = []
     for seed in range(12):
-        found = fit(
+        fitted = fit(
             np.eye(4), exp_se3(np.array([0.05, 0.02, -0.03]), np.array([0.01, 0.0, 0.02])), seed
         )
-        C = covariance_of(found, found.target_T_query, np.eye(4), 0.3)
-        e = found.target_T_query[:3, 3]
+        C = covariance_of(fitted, fitted.target_T_query, np.eye(4), 0.3)
+        e = fitted.target_T_query[:3, 3]
         squared.append(float(e @ np.linalg.solve(C[:3, :3], e)))
     assert np.mean(squared) < 3  # three degrees of freedom
 
@@ -221,11 +221,11 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
     mapped = flattened_surface(
         grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05
     )
-    for found in (
+    for fitted in (
         align(query, surface_of(grid, CELL), np.eye(4), STEPS, np.tile(along, (len(query), 1))),
         align(query, mapped, np.eye(4), STEPS),
     ):
-        more = covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] - least
+        more = covariance_of(fitted, np.eye(4), np.eye(4), 0.3)[0, 0] - least
         assert np.sqrt(more) == pytest.approx(RANGE_BIAS * 0.1, rel=0.1)
 
 
@@ -267,9 +267,9 @@ def test_ranges_pull_no_farther_than_points_hold() -> None:
     rng = np.random.default_rng(5)
     points = room(rng, 700, corridor=True)
     far = 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
-    found = align(points, surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS, far)
+    fitted = align(points, surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS, far)
     assert (
-        covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (SAME_PLACE_VOXELS * 0.3) ** 2
+        covariance_of(fitted, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (SAME_PLACE_VOXELS * 0.3) ** 2
     )
 
 
@@ -286,9 +286,9 @@ DRIFT = Drift((0.01, 0.02, 0.03), (1e-3, 2e-3, 3e-3))
 
 def added(query: Stretch, target: Stretch, target_T_query: F64) -> F64:
     """What the drift along both stretches adds to a covariance (6, 6)."""
-    found = fit(np.eye(4), SMALL)
+    fitted = fit(np.eye(4), SMALL)
     alone, bridged = (
-        covariance_of(found, target_T_query, np.eye(4), 0.3, stretches)
+        covariance_of(fitted, target_T_query, np.eye(4), 0.3, stretches)
         for stretches in ((Stretch(), Stretch()), (query, target))
     )
     return bridged - alone

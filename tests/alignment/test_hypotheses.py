@@ -40,16 +40,16 @@ def test_votes_are_those_of_a_dictionary(seed: int) -> None:
     yaw = rng.choice([0.0, 0.5, 1.0], n)
     t = rng.uniform(-3, 3, (n, 3)) * [1, 1, 0.3]
     weight = rng.uniform(0.1, 1.0, n)
-    found = pool(group, yaw, t, weight, 1.2, 500)
+    hypotheses = pool(group, yaw, t, weight, 1.2, 500)
     expected = slow_pool(group.tolist(), yaw.tolist(), t, weight.tolist(), 1.2)
     by_weight = {round(w, 9): (g, y, m) for w, g, y, m in expected}
-    for h in found:
+    for h in hypotheses:
         g, y, mean = by_weight[round(h.weight, 9)]
         assert (h.group, h.pose[0]) == (g, y)
         np.testing.assert_allclose(h.pose[1:], mean, atol=1e-9)
         members = (group == g) & (yaw == y) & (np.abs(t - mean).max(1) < 1.2)
         assert 1 <= h.votes <= members.sum()
-    weights = [h.weight for h in found]
+    weights = [h.weight for h in hypotheses]
     assert weights == sorted(weights, reverse=True)
     assert weights[0] == pytest.approx(expected[0][0])
     for w, g, y, mean in expected:  # every cell is there, itself or as its twin of the other grid
@@ -58,15 +58,15 @@ def test_votes_are_those_of_a_dictionary(seed: int) -> None:
             and h.pose[0] == y
             and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3
             and h.weight >= w - 1e-9
-            for h in found
+            for h in hypotheses
         )
 
 
 def test_the_heaviest_are_kept() -> None:
     group = np.zeros(11, np.int64)
     t = np.array([[0.5, 0.5, 0.5]] * 5 + [[9.5, 0.5, 0.5]] * 4 + [[20.5, 0.5, 0.5]] * 2)
-    found = pool(group, np.zeros(11), t, np.ones(11), 2.0, 2)
-    assert [(h.votes, h.weight, h.pose) for h in found] == [
+    hypotheses = pool(group, np.zeros(11), t, np.ones(11), 2.0, 2)
+    assert [(h.votes, h.weight, h.pose) for h in hypotheses] == [
         (5, 5.0, (0.0, 0.5, 0.5, 0.5)),
         (4, 4.0, (0.0, 9.5, 0.5, 0.5)),
     ]
@@ -94,21 +94,21 @@ def test_of_equally_heavy_cells_the_first_are_kept() -> None:
     number = np.random.default_rng(0).permutation(2000)
     t = np.column_stack([number * 2.0 + 0.5, np.full(2000, 0.5), np.full(2000, 0.5)])
     weight = np.where(number % 3 == 1, 2.0, 1.0)
-    found = pool(np.zeros(2000, np.int64), np.zeros(2000), t, weight, 2.0, 3)
-    assert [h.pose[1] for h in found] == [2.5, 8.5, 14.5]
+    hypotheses = pool(np.zeros(2000, np.int64), np.zeros(2000), t, weight, 2.0, 3)
+    assert [h.pose[1] for h in hypotheses] == [2.5, 8.5, 14.5]
 
 
 def test_a_pose_at_a_cell_border_is_counted_whole() -> None:
     t = np.array([[1.99, 0.5, 0.5], [2.01, 0.5, 0.5], [1.98, 0.5, 0.5], [2.02, 0.5, 0.5]])
-    found = pool(np.zeros(4, np.int64), np.zeros(4), t, np.ones(4), 2.0, 10)
-    assert found[0].votes == 4
-    np.testing.assert_allclose(found[0].pose, (0, 2.0, 0.5, 0.5))
+    hypotheses = pool(np.zeros(4, np.int64), np.zeros(4), t, np.ones(4), 2.0, 10)
+    assert hypotheses[0].votes == 4
+    np.testing.assert_allclose(hypotheses[0].pose, (0, 2.0, 0.5, 0.5))
 
 
 def test_matches_of_other_submaps_and_headings_do_not_add_up() -> None:
     t = np.full((3, 3), 0.3)
-    found = pool(np.array([0, 1, 1]), np.array([0.0, 0.0, 0.5]), t, np.ones(3), 1.0, 10)
-    assert sorted((h.group, h.pose[0], h.votes) for h in found) == [
+    hypotheses = pool(np.array([0, 1, 1]), np.array([0.0, 0.0, 0.5]), t, np.ones(3), 1.0, 10)
+    assert sorted((h.group, h.pose[0], h.votes) for h in hypotheses) == [
         (0, 0.0, 1),
         (1, 0.0, 1),
         (1, 0.5, 1),
@@ -136,16 +136,16 @@ def test_a_pose_beside_a_better_one_is_left_out() -> None:
 
 
 def test_the_submaps_with_the_heaviest_hypotheses_are_looked_into() -> None:
-    found = [
+    hypotheses = [
         Hypothesis(group, (0.0, float(k), 0.0, 0.0), 1, weight)
         for k, (group, weight) in enumerate([(7, 1.0), (2, 3.0), (7, 4.0), (5, 3.0)])
     ]
-    assert [h.group for h in keep_best_submaps(found, 2)] == [7, 2, 7]
-    assert [h.group for h in keep_best_submaps(found[::-1], 2)] == [7, 2, 7]
+    assert [h.group for h in keep_best_submaps(hypotheses, 2)] == [7, 2, 7]
+    assert [h.group for h in keep_best_submaps(hypotheses[::-1], 2)] == [7, 2, 7]
     # not those with the most of them
     many = [Hypothesis(8, (0.0, float(k), 0.0, 0.0), 1, 2.0) for k in range(3)]
-    assert [h.group for h in keep_best_submaps([*many, found[1]], 1)] == [2]
-    assert keep_best_submaps(found, 9) == found
+    assert [h.group for h in keep_best_submaps([*many, hypotheses[1]], 1)] == [2]
+    assert keep_best_submaps(hypotheses, 9) == hypotheses
     assert keep_best_submaps([], 3) == []
 
 

@@ -30,12 +30,12 @@ F64 = NDArray[np.float64]
     ],
 )
 def test_a_known_transform_is_found_to_a_millimetre(truth: F64) -> None:
-    found = fit(truth, truth @ SMALL, noise=0.004)
-    distance, angle = error(found.target_T_query, truth)
+    fitted = fit(truth, truth @ SMALL, noise=0.004)
+    distance, angle = error(fitted.target_T_query, truth)
     assert distance < 0.001
     assert angle < 0.0005
-    assert found.inliers > 0.98
-    assert 0.004 < found.rmse < 0.012  # the noise of the points and of the planes
+    assert fitted.inliers > 0.98
+    assert 0.004 < fitted.rmse < 0.012  # the noise of the points and of the planes
     assert error(truth @ SMALL, truth)[0] > 0.2  # there was something to find
 
 
@@ -57,17 +57,17 @@ def test_far_from_the_origin_the_result_is_the_same() -> None:
     target = room(rng, 1200)
     query = room(rng, 600)
     shift = yaw_transform(0.0, (30_000.0, -20_000.0, 500.0))
-    near = align(query, surface_of(target, CELL), SMALL, STEPS)
+    at_origin = align(query, surface_of(target, CELL), SMALL, STEPS)
     far = align(query, surface_of(apply(shift, target), CELL), shift @ SMALL, STEPS)
-    assert error(inverse(shift) @ far.target_T_query, near.target_T_query)[0] < 1e-4
+    assert error(inverse(shift) @ far.target_T_query, at_origin.target_T_query)[0] < 1e-4
     both = align(
         apply(shift, query),
         surface_of(apply(shift, target), CELL),
         shift @ SMALL @ inverse(shift),
         STEPS,
     )
-    assert error(apply_both(shift, both.target_T_query), near.target_T_query)[0] < 1e-4
-    np.testing.assert_allclose(far.information, near.information, rtol=0.02, atol=2)
+    assert error(apply_both(shift, both.target_T_query), at_origin.target_T_query)[0] < 1e-4
+    np.testing.assert_allclose(far.information, at_origin.information, rtol=0.02, atol=2)
 
 
 def apply_both(shift: F64, T: F64) -> F64:
@@ -78,9 +78,9 @@ def test_outliers_are_not_followed() -> None:
     rng = np.random.default_rng(3)
     target = surface_of(room(rng, 1500), CELL)
     query = np.concatenate([room(rng, 500), rng.uniform((-4, -2.5, 0), (4, 2.5, 3), (1500, 3))])
-    found = align(query, target, SMALL, STEPS)
-    assert error(found.target_T_query, np.eye(4))[0] < 0.01
-    assert 0.5 < found.inliers < 0.95
+    fitted = align(query, target, SMALL, STEPS)
+    assert error(fitted.target_T_query, np.eye(4))[0] < 0.01
+    assert 0.5 < fitted.inliers < 0.95
 
 
 def test_information_of_point_distances_is_that_of_numerical_differences() -> None:
@@ -98,11 +98,11 @@ def test_information_of_point_distances_is_that_of_numerical_differences() -> No
                 - apply(exp_se3(-step[:3], -step[3:]), a[None])[0]
             ) / 2e-6
         expected += w * J.T @ J
-    found = np.zeros((6, 6))
+    information = np.zeros((6, 6))
     g = np.zeros(6)
     for a, w in zip(arm, weight, strict=True):
-        _add_point(found, g, a, np.array([0.1, -0.3, 0.2]), w)
-    np.testing.assert_allclose(np.triu(found), np.triu(expected), atol=1e-6)
+        _add_point(information, g, a, np.array([0.1, -0.3, 0.2]), w)
+    np.testing.assert_allclose(np.triu(information), np.triu(expected), atol=1e-6)
     o = np.array([0.1, -0.3, 0.2])
     np.testing.assert_allclose(
         g, np.r_[weight.sum() * o, (np.cross(arm, o) * weight[:, None]).sum(0)]
@@ -126,11 +126,11 @@ def test_leaves_without_any_plane_hold_an_alignment_too() -> None:
 def test_nothing_to_align() -> None:
     target = surface_of(room(np.random.default_rng(0), 100), CELL)
     for query in (np.zeros((0, 3)), np.full((50, 3), 1e4), np.zeros((5, 3))):
-        found = align(query, target, SMALL, STEPS)
-        assert found.inliers == 0
-        assert found.rmse == np.inf
-        assert not found.information.any()
-        np.testing.assert_array_equal(found.target_T_query, SMALL)
+        fitted = align(query, target, SMALL, STEPS)
+        assert fitted.inliers == 0
+        assert fitted.rmse == np.inf
+        assert not fitted.information.any()
+        np.testing.assert_array_equal(fitted.target_T_query, SMALL)
     empty = align(
         room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3)), CELL), SMALL, STEPS
     )
@@ -140,8 +140,8 @@ def test_nothing_to_align() -> None:
 @pytest.mark.parametrize(("count", "inliers"), [(11, 0.0), (12, 1.0)])
 def test_twelve_points_are_enough(count: int, inliers: float) -> None:
     floor = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), 0.0), -1).reshape(-1, 3)
-    found = align(floor[:count], surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
-    assert (found.count, found.inliers) == (count, inliers)
+    fitted = align(floor[:count], surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
+    assert (fitted.count, fitted.inliers) == (count, inliers)
 
 
 def test_distances_are_of_the_points_that_meet_a_surface() -> None:
@@ -149,10 +149,10 @@ def test_distances_are_of_the_points_that_meet_a_surface() -> None:
     floor = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), 0.0), -1).reshape(-1, 3)
     query = floor[:40] + np.array([0.0, 0.0, 0.1])
     query[20:, 2] = 10.0
-    found = align(query, surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
-    assert (found.count, found.inliers) == (20, 0.5)
-    assert found.rmse == pytest.approx(0.1)
-    np.testing.assert_array_equal(found.target_T_query, np.eye(4))  # a step of no iterations
+    fitted = align(query, surface_of(floor, 1.0), np.eye(4), (Step(0.4, 0),))
+    assert (fitted.count, fitted.inliers) == (20, 0.5)
+    assert fitted.rmse == pytest.approx(0.1)
+    np.testing.assert_array_equal(fitted.target_T_query, np.eye(4))  # a step of no iterations
 
 
 def test_of_an_increment_that_turns_too_far_the_same_share_moves() -> None:
@@ -190,9 +190,9 @@ def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
     surface = point_surface(there, there_spread, v)
     assert surface.sigma > 0.25 * v
     query = Query(Fuser(Settings().resolved().fusion).finish(), here, v, here_spread)
-    found = fine_fit(start, surface, query).target_T_query
-    assert np.linalg.norm(found[1:3, 3]) < 0.06
-    assert error(found, np.eye(4))[0] < 0.22
+    target_T_query = fine_fit(start, surface, query).target_T_query
+    assert np.linalg.norm(target_T_query[1:3, 3]) < 0.06
+    assert error(target_T_query, np.eye(4))[0] < 0.22
     plain = fine_fit(start, surface_of(there, 2 * v), replace(query, spread=None))
     assert error(plain.target_T_query, np.eye(4))[0] > 0.3
 
@@ -210,9 +210,9 @@ def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -
     spread = np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
     # a kernel this wide weighs all points alike; the last step measures the result
     wide = (Step(100.0, 15), Step(100.0, 0))
-    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, Weighting(0.1))
-    assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
-    assert found.rmse == pytest.approx(
+    fitted = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, Weighting(0.1))
+    assert fitted.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
+    assert fitted.rmse == pytest.approx(
         np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02
     )
 
@@ -227,8 +227,8 @@ def test_a_start_holds_where_little_says_otherwise() -> None:
     rng = np.random.default_rng(0)
     query = np.c_[np.full(40, 0.1), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
     hold = Weighting(hold=40.0)
-    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), weighting=hold)
-    assert found.target_T_query[0, 3] == pytest.approx(-0.05, rel=0.01)
+    fitted = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), weighting=hold)
+    assert fitted.target_T_query[0, 3] == pytest.approx(-0.05, rel=0.01)
 
 
 def test_rays_turn_with_the_query() -> None:
@@ -244,11 +244,11 @@ def test_rays_turn_with_the_query() -> None:
     turned = yaw_transform(np.pi / 2)
     query = apply(inverse(turned), surface.points + np.array([0.0, 0.3, 0.0]))
     rays = np.tile([0.3, 0.0, 0.0], (100, 1))
-    found = align(query, surface, turned, (Step(2.0, 0),), rays, Weighting(0.1))
+    fitted = align(query, surface, turned, (Step(2.0, 0),), rays, Weighting(0.1))
     weight = 100 * 0.1 * 2 / 3
-    assert found.information[1, 1] == pytest.approx(weight)
+    assert fitted.information[1, 1] == pytest.approx(weight)
     expected = [0.0, weight * 0.3, 0.0, 0.0, 0.0, 0.0]
-    np.testing.assert_allclose(found.range_bias, [expected, [0.0] * 6], atol=1e-9)
+    np.testing.assert_allclose(fitted.range_bias, [expected, [0.0] * 6], atol=1e-9)
 
 
 def test_leaves_pull_by_how_certain_they_are() -> None:
@@ -265,8 +265,8 @@ def test_leaves_pull_by_how_certain_they_are() -> None:
     aside = np.array([0.3, 0.0, 0.0])
     rays = np.r_[np.zeros((8, 3)), np.tile([0.0, 0.3, 0.0], (8, 1))]
     query = np.r_[corners + aside, corners - aside]
-    found = align(query, surface, np.eye(4), (Step(2.0, 1),), rays, Weighting(0.3))
-    np.testing.assert_allclose(found.target_T_query[:3, 3], [-0.06, 0.0, 0.0], atol=1e-5)
+    fitted = align(query, surface, np.eye(4), (Step(2.0, 1),), rays, Weighting(0.3))
+    np.testing.assert_allclose(fitted.target_T_query[:3, 3], [-0.06, 0.0, 0.0], atol=1e-5)
 
 
 def test_distances_to_planes_are_those_of_where_a_fit_ends() -> None:
@@ -276,9 +276,9 @@ def test_distances_to_planes_are_those_of_where_a_fit_ends() -> None:
     side = np.stack(np.meshgrid(np.linspace(0, 4, 40), np.linspace(0, 4, 40)), -1).reshape(-1, 2)
     walls = np.concatenate([np.insert(side, axis, 0.0, axis=1) for axis in range(3)])
     query = walls[walls.max(1) < 3][::7] + np.array([0.0, 0.0, 0.005])
-    found = align(query, surface_of(walls, CELL), np.eye(4), (Step(0.4, 10),))
-    assert found.rmse < 1e-4
-    np.testing.assert_allclose(found.target_T_query[:3, 3], [0.0, 0.0, -0.005], atol=1e-4)
+    fitted = align(query, surface_of(walls, CELL), np.eye(4), (Step(0.4, 10),))
+    assert fitted.rmse < 1e-4
+    np.testing.assert_allclose(fitted.target_T_query[:3, 3], [0.0, 0.0, -0.005], atol=1e-4)
 
 
 def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> None:
@@ -292,8 +292,8 @@ def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> Non
     spread = np.r_[np.zeros_like(side), np.tile([0.2, 0.0, 0.0], (len(side), 1))]
     mapped = walls + np.r_[np.zeros_like(side), np.tile([0.1, 0.0, 0.0], (len(side), 1))]
     surface = flattened_surface(mapped, spread, np.arange(len(mapped)), CELL, 0.1)
-    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), weighting=Weighting(0.1))
-    assert found.target_T_query[0, 3] == pytest.approx(0.1 * 0.2 / 1.2, rel=0.05)
+    fitted = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), weighting=Weighting(0.1))
+    assert fitted.target_T_query[0, 3] == pytest.approx(0.1 * 0.2 / 1.2, rel=0.05)
 
 
 def test_a_fit_that_meets_too_little_knows_nothing() -> None:
@@ -303,9 +303,9 @@ def test_a_fit_that_meets_too_little_knows_nothing() -> None:
     rng = np.random.default_rng(6)
     points = room(rng, 700, noise=0.0)
     off = points + np.array([0.17, 0.17, 0.17]) * rng.choice([-1, 1], (len(points), 1))
-    found = align(
+    fitted = align(
         off, surface_of(room(rng, 1500, noise=0.0), CELL), np.eye(4), (Step(0.4, 1), Step(0.001, 1))
     )
-    assert (found.inliers, found.rmse) == (0.0, float("inf"))
-    assert not found.information.any()
-    assert not found.range_bias.any()
+    assert (fitted.inliers, fitted.rmse) == (0.0, float("inf"))
+    assert not fitted.information.any()
+    assert not fitted.range_bias.any()

@@ -42,10 +42,10 @@ def test_ground_that_is_lifted_as_a_whole_makes_height_and_tilt_uncertain(left_o
     covariances = []
     for lifted in (0.0, 0.2):
         points = ground_and_walls(rng, lifted, left_only)
-        found = align(points, surface, np.eye(4), (Step(0.12, 10),))
-        bias = ground_bias(points, surface, found.target_T_query, found.centre, 0.45, 0.12)
+        fitted = align(points, surface, np.eye(4), (Step(0.12, 10),))
+        bias = ground_bias(points, surface, fitted.target_T_query, fitted.centre, 0.45, 0.12)
         covariances.append(
-            covariance_of(replace(found, ground_bias=bias), np.eye(4), np.eye(4), 0.3)
+            covariance_of(replace(fitted, ground_bias=bias), np.eye(4), np.eye(4), 0.3)
         )
     same, snow = covariances
     mean = 0.2 * (0.35 if left_only else 0.7)

@@ -172,8 +172,8 @@ def test_the_best_of_many_are_the_best_by_the_slow_one(seed: int, most: int) -> 
             share, _ = tau(occupied, blocks, 1.0, pose, reach)
             if share >= 0.05:
                 slow.append((-share, number, row))
-    found = best_overlaps(overlap_map(blocks, reach), query_voxels(occupied), groups, most, 0.05)
-    assert [(-f.tau, f.group, f.row) for f in found] == sorted(slow)[:most]
+    best = best_overlaps(overlap_map(blocks, reach), query_voxels(occupied), groups, most, 0.05)
+    assert [(-f.tau, f.group, f.row) for f in best] == sorted(slow)[:most]
 
 
 def test_classes_beyond_the_masks_are_refused() -> None:
@@ -185,20 +185,20 @@ def test_classes_beyond_the_masks_are_refused() -> None:
 def test_voxels_that_leave_the_map_do_not_hide_the_others(axis: int) -> None:
     """One of two voxels lies on the road after a shift by 5, the other one 10,000 voxels off."""
     target = overlap_map(blocks_of({(0, 0, 0): ROAD}), 1.0)
-    near = np.zeros(4, int)
-    near[axis] = -5
+    inside = np.zeros(4, int)
+    inside[axis] = -5
     far = np.array([0, 0, 0, ROAD])
     far[axis] = 10_000
     shift = np.zeros((1, 3), np.int64)
     shift[0, axis] = 5
-    found = best_overlaps(
+    best = best_overlaps(
         target,
-        query_voxels(query(tuple(near.tolist()), tuple(far.tolist()))),
+        query_voxels(query(tuple(inside.tolist()), tuple(far.tolist()))),
         [Shifts(np.eye(3), np.zeros(3), shift)],
         1,
         0.4,
     )
-    assert [ranked.tau for ranked in found] == [0.5]
+    assert [ranked.tau for ranked in best] == [0.5]
 
 
 @settings(max_examples=5, deadline=None)

@@ -57,8 +57,8 @@ def test_voxels_stay_in_the_grid_whatever_the_shift(axis: int) -> None:
     )
     inside = np.arange(REACH, shape[axis] - REACH)  # of the cells along the axis
     assert count == len(inside)
-    found = np.stack(np.unravel_index(base[:count], shape), axis=1)
-    np.testing.assert_array_equal(found[:, axis], inside)
+    voxels = np.stack(np.unravel_index(base[:count], shape), axis=1)
+    np.testing.assert_array_equal(voxels[:, axis], inside)
     np.testing.assert_array_equal(kept[:count], inside + 2)
 
 
@@ -76,8 +76,8 @@ def test_no_candidate_stays_where_none_can_become_good(
     mutual = SimpleNamespace(score=0.5, is_consistent=is_consistent)
     monkeypatch.setattr(search_module, "mutual_scores", lambda *_: mutual)
     target = cast(Any, None)
-    found = _chosen([Candidate(3, np.eye(4), score, 1)], {3: target}, cast(Any, None), 5)
-    assert len(found) == kept
+    candidates = _chosen([Candidate(3, np.eye(4), score, 1)], {3: target}, cast(Any, None), 5)
+    assert len(candidates) == kept
 
 
 def test_hypotheses_are_searched_twice_and_those_that_meet_become_one(
@@ -87,7 +87,7 @@ def test_hypotheses_are_searched_twice_and_those_that_meet_become_one(
     last one beside the one at 10, in steps of two; poses 3 voxels apart are one after the second.
     """
     v = 0.5
-    found = {
+    search_results = {
         200: {0.0: (0.4, 0.0), 3.0: (0.45, 3.0), 10.0: (0.5, 10.0), 20.0: (0.6, 11.5)},
         SEARCH_VOXELS: {0.0: (0.7, 0.0), 3.0: (0.5, 3.0), 11.5: (0.3, 11.5)},
     }
@@ -97,7 +97,7 @@ def test_hypotheses_are_searched_twice_and_those_that_meet_become_one(
         grid: str, evidence: int, start: NDArray[np.float64], yaws: NDArray[np.float64], step: int
     ) -> tuple[float, NDArray[np.float64]]:
         searches.append((grid, evidence, start[1] / v, round(np.degrees(yaws.max()), 9), step))
-        score, x = found[evidence][start[1] / v]
+        score, x = search_results[evidence][start[1] / v]
         return score, np.array([0.0, x * v, 0.0, 0.0])
 
     mutual = SimpleNamespace(score=0.5, is_consistent=True)

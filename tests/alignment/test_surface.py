@@ -25,9 +25,11 @@ def test_the_nearest_is_that_of_brute_force(seed: int, cell: float, radius: floa
     query = rng.uniform(-3, 3, (60, 3)) + 1e4
     surface = surface_of(points, cell)
     assert sorted(map(tuple, surface.points)) == sorted(map(tuple, points))
-    found = nearest_points(surface.arrays, query, radius)
+    nearest = nearest_points(surface.arrays, query, radius)
     distance = np.linalg.norm(query[:, None] - surface.points[None], axis=2)
-    np.testing.assert_array_equal(found, np.where(distance.min(1) < radius, distance.argmin(1), -1))
+    np.testing.assert_array_equal(
+        nearest, np.where(distance.min(1) < radius, distance.argmin(1), -1)
+    )
 
 
 def test_planes_are_made_where_they_are_met() -> None:
@@ -51,11 +53,11 @@ def test_the_points_around_a_point_are_those_of_brute_force(seed: int, cell: flo
     """300 points in 4 m: more than enough lie within the rings of cells, whatever the axis."""
     rng = np.random.default_rng(seed)
     surface = surface_of(rng.uniform(-2, 2, (300, 3)), cell)
-    found = _around(surface.points, surface.cells, np.arange(300))
+    neighbours = _around(surface.points, surface.cells, np.arange(300))
     distance = np.linalg.norm(surface.points[:, None] - surface.points, axis=2)
     nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
     assert np.sort(distance, axis=1)[:, NEIGHBOURS - 1].max() < RINGS * cell
-    np.testing.assert_array_equal(found, nearest)
+    np.testing.assert_array_equal(neighbours, nearest)
 
 
 def test_a_plane_is_less_than_0_3_times_as_thick_as_wide() -> None:
@@ -115,13 +117,15 @@ def test_flattened_points_lie_on_the_plane_of_a_slow_weighted_fit(seed: int) -> 
     for p in points[kept]:
         around = np.linalg.norm(points - p, axis=1) <= radius
         w = 1 / (noise**2 + sigma[around] ** 2)
-        near = points[around]
-        if len(near) < LEAST_FLAT:
+        neighbours = points[around]
+        if len(neighbours) < LEAST_FLAT:
             expected.append(p)
             continue
-        mean = (w[:, None] * near).sum(0) / w.sum()
+        mean = (w[:, None] * neighbours).sum(0) / w.sum()
         normal = np.linalg.eigh(
-            (w[:, None, None] * (near - mean)[:, :, None] * (near - mean)[:, None]).sum(0)
+            (w[:, None, None] * (neighbours - mean)[:, :, None] * (neighbours - mean)[:, None]).sum(
+                0
+            )
         )[1][:, 0]
         expected.append(p - normal * ((p - mean) @ normal))
     order = np.lexsort(np.round(surface.points, 6).T)

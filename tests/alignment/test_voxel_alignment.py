@@ -109,9 +109,9 @@ def test_masks_are_those_of_slow_loops(seed: int) -> None:
                     1 << COARSE[state] if COARSE[state] < 6 else 0
                 )
     for ijk, state in cells.items():
-        at = tuple(np.array(ijk) - corner)
-        if state == FREE_STATE and expected[at] == 0:
-            expected[at] = FREE_BIT
+        cell = tuple(np.array(ijk) - corner)
+        if state == FREE_STATE and expected[cell] == 0:
+            expected[cell] = FREE_BIT
     np.testing.assert_array_equal(grid.mask, expected)
 
 
@@ -184,10 +184,10 @@ def test_tau_is_that_of_brute_force(
     T = yaw_transform(yaw, (t[0] + 1e-7, t[1] + 1e-7, t[2] + 1e-7)) @ exp_se3(
         np.zeros(3), np.array([0.03, -0.02, 0.0])
     )
-    found = tau(
+    ratio = tau(
         block_map(query).occupied(), block_map(target), V, T, kappa, COARSE if coarse else None
     )
-    assert found == pytest.approx(slow_tau(query, target, T, kappa, coarse))
+    assert ratio == pytest.approx(slow_tau(query, target, T, kappa, coarse))
 
 
 def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
@@ -287,23 +287,23 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
         target.mask_grid, query.evidence, pose, np.linspace(-0.1, 0.1, 9).tolist(), 1
     )
     assert score > 0.9
-    found = pose_matrix(pose)
-    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2.5 * V
-    assert yaw_between(found, truth) < np.radians(5)
+    target_T_query = pose_matrix(pose)
+    assert np.linalg.norm(target_T_query[:3, 3] - truth[:3, 3]) < 2.5 * V
+    assert yaw_between(target_T_query, truth) < np.radians(5)
     beside, _ = search(
         target.mask_grid, query.evidence, start + np.array([0.5, 6, 6, 2]), (0.0,), 1
     )
     assert beside < 0.7 * score
 
     wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
-    near = Hypothesis(0, (yaw + 0.15, 4.2, -3.0, 0.5), 2, 0.5)
-    candidates = search_hypotheses([*wrong, near], {0: target}, query, 18, 24)
+    right = Hypothesis(0, (yaw + 0.15, 4.2, -3.0, 0.5), 2, 0.5)
+    candidates = search_hypotheses([*wrong, right], {0: target}, query, 18, 24)
     best = candidates[0]
     assert same_place(best.target_T_query, truth, V)
     assert best.votes == 2
     assert candidates[0].score == max(c.score for c in candidates)
     assert len(candidates) <= 24
-    twice = search_hypotheses([near, near], {0: target}, query, 18, 24)
+    twice = search_hypotheses([right, right], {0: target}, query, 18, 24)
     assert len(twice) == 1  # hypotheses at the same pose are merged
     away = Hypothesis(0, (yaw, 60.0, 0.0, 0.0), 3, 1.0)
     assert search_hypotheses([away], {0: target}, query, 18, 24) == []  # too bad to be fitted
@@ -316,10 +316,14 @@ def test_a_candidate_that_both_sides_hold_for_right_is_kept_though_few_voxels_ov
     space, and none of them contradicts; elsewhere a third of many does.
     """
     far = Scores(5000, 500, 450, 0)
-    near = Scores(5000, 4000, 2000, 1300)
+    contradicted = Scores(5000, 4000, 2000, 1300)
 
     def scores(query: object, target: object, pose: np.ndarray) -> MutualScores:
-        return MutualScores(far, far) if pose[0, 3] == 4.0 else MutualScores(near, near)
+        return (
+            MutualScores(far, far)
+            if pose[0, 3] == 4.0
+            else MutualScores(contradicted, contradicted)
+        )
 
     monkeypatch.setattr(search_module, "mutual_scores", scores)
     rows = [Candidate(0, yaw_transform(0.0, (x, 0, 0)), 0.9 - 0.1 * x, 3) for x in np.arange(6.0)]
@@ -407,10 +411,10 @@ def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
         for y in sides[1]
         for z in sides[2]
     ]
-    found, pose = search(grid, e, start, yaws, step)
+    best, pose = search(grid, e, start, yaws, step)
     # of equals the nearest: 1e-6 a cell
-    assert found == pytest.approx(max(map(value, poses)), abs=2e-5)
-    assert value(pose) == pytest.approx(found, abs=2e-5)
+    assert best == pytest.approx(max(map(value, poses)), abs=2e-5)
+    assert value(pose) == pytest.approx(best, abs=2e-5)
     assert np.abs(np.array(poses) - pose).max(1).min() < 1e-9
 
 
@@ -523,14 +527,14 @@ def test_an_alignment_is_measured_as_it_is(degrees: int) -> None:
     target = Target(block_map(town()), V)
     points = points_of(town())
     query = Query(block_map(moved(town(), truth)), apply(inverse(truth), points), V)
-    found = measured(truth, target.surface, query)
-    np.testing.assert_array_equal(found.target_T_query, truth)
-    assert found.inliers > 0.99
-    assert found.rmse < 0.1 * V
-    assert found.count == pytest.approx(len(points[::3]), rel=0.01)
+    fit = measured(truth, target.surface, query)
+    np.testing.assert_array_equal(fit.target_T_query, truth)
+    assert fit.inliers > 0.99
+    assert fit.rmse < 0.1 * V
+    assert fit.count == pytest.approx(len(points[::3]), rel=0.01)
     whole = align(query.points, target.surface, truth, (Step(0.4 * V, 0, 1),))
     np.testing.assert_allclose(
-        found.information[:3, :3],
+        fit.information[:3, :3],
         whole.information[:3, :3],
         rtol=0.05,
         atol=0.02 * whole.information[:3, :3].max(),
@@ -556,8 +560,8 @@ def test_a_coarse_fit_leaves_a_place_that_looks_alike(degrees: int) -> None:
 
     beside = yaw_transform(0.0, (2 * V, -2 * V, 0.0)) @ truth
     wrong = measured(beside, target.surface, query)
-    found = escaped(wrong, candidate, target, query, 20)
-    assert np.linalg.norm(found.target_T_query[:3, 3] - truth[:3, 3]) < 0.2 * V
+    escaped_fit = escaped(wrong, candidate, target, query, 20)
+    assert np.linalg.norm(escaped_fit.target_T_query[:3, 3] - truth[:3, 3]) < 0.2 * V
     fine = fine_fit(right.target_T_query, target.surface, query)
     assert np.linalg.norm(fine.target_T_query[:3, 3] - truth[:3, 3]) < 0.1 * V
     assert fine.count == len(query.points)  # the last step takes all of them
@@ -627,10 +631,10 @@ def test_a_coarse_fit_is_left_for_a_start_a_voxel_away_that_scores_higher(
     query = cast(Any, SimpleNamespace(voxel_size=V, evidence=None))
     fit = fit_at(2.0)
     candidate = Candidate(0, np.eye(4), 1.0, 10)
-    found = escaped(fit, candidate, cast(Any, SimpleNamespace(mask_grid=None)), query, 18)
+    escaped_fit = escaped(fit, candidate, cast(Any, SimpleNamespace(mask_grid=None)), query, 18)
     np.testing.assert_allclose(turns, [[-6.0, -3.0, 0.0, 3.0, 6.0]], atol=1e-12)
-    assert found.target_T_query[0, 3] == pytest.approx(2.0 + voxels * V if leaves else 2.0)
-    assert (found is fit) != leaves
+    assert escaped_fit.target_T_query[0, 3] == pytest.approx(2.0 + voxels * V if leaves else 2.0)
+    assert (escaped_fit is fit) != leaves
 
 
 def test_an_alignment_of_uncertain_points_is_measured_by_their_radius() -> None:
@@ -640,13 +644,13 @@ def test_an_alignment_of_uncertain_points_is_measured_by_their_radius() -> None:
     spread = 0.8 * V * points / np.linalg.norm(points, axis=1, keepdims=True)
     query = Query(block_map(town()), points, V, spread)
     beside = yaw_transform(0.0, (0.0, 0.0, 1.5 * V))
-    found = measured(beside, target.surface, query)
+    fit = measured(beside, target.surface, query)
     step = Step(UNCERTAIN_RADII[1] * V, 0, 1)
     whole = align(points, target.surface, beside, (step,), spread, Weighting(PLANE_NOISE * V))
-    assert found.inliers == pytest.approx(whole.inliers, abs=0.02)
+    assert fit.inliers == pytest.approx(whole.inliers, abs=0.02)
     assert np.abs(whole.range_bias).max() > 0
     np.testing.assert_allclose(
-        found.range_bias, whole.range_bias, atol=0.1 * np.abs(whole.range_bias).max()
+        fit.range_bias, whole.range_bias, atol=0.1 * np.abs(whole.range_bias).max()
     )
 
 

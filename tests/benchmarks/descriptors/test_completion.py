@@ -28,9 +28,9 @@ def codes(*values: int) -> np.ndarray:
 def test_figures_by_hand() -> None:
     # the last two do not count
     truth = codes(2, 2, 8, 8, FREE, FREE, FREE, FREE, UNOBSERVED, UNKNOWN)
-    said = codes(2, 8, 8, 8, FREE, FREE, FREE, 2, FREE, FREE)
+    predicted = codes(2, 8, 8, 8, FREE, FREE, FREE, 2, FREE, FREE)
     given = codes(2, UNOBSERVED, 8, UNKNOWN, FREE, UNOBSERVED, UNOBSERVED, FREE, 3, 3)
-    figures = completion_figures(Completed(given, said, truth, truth, CLASSES))
+    figures = completion_figures(Completed(given, predicted, truth, truth, CLASSES))
     assert figures["accuracy"]["ours"] == pytest.approx(6 / 8)
     assert figures["accuracy"]["all_free"] == pytest.approx(4 / 8)
     assert figures["accuracy"]["copy_input"] == pytest.approx(4 / 8)
@@ -67,9 +67,9 @@ def pairs(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("variant", ["semantic", "geometric"])
 def test_the_shipped_network_completes(variant: str) -> None:
     model = load_completion(variant)
-    found = completed(model, pairs(1))
-    assert found.completed.shape == (1, 32, 32, 32)
-    figures = completion_figures(found)
+    completion = completed(model, pairs(1))
+    assert completion.completed.shape == (1, 32, 32, 32)
+    figures = completion_figures(completion)
     assert float(figures["accuracy"]["ours"]) > float(figures["accuracy"]["copy_input"])
 
 

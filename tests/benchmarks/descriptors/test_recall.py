@@ -45,17 +45,17 @@ def test_found_again_as_the_slow_reference_says() -> None:
     rng = np.random.default_rng(0)
     database = Words(rng.uniform(0, 20, (700, 3)), rng.normal(size=(700, 4)).astype(np.float32))
     asked = Words(rng.uniform(0, 20, (300, 3)), rng.normal(size=(300, 4)).astype(np.float32))
-    found = found_again(asked, database, 6.0)
+    is_recalled = found_again(asked, database, 6.0)
     for i in range(300):
         distance = [
             float(np.linalg.norm(asked.descriptor[i].astype(float) - d))
             for d in database.descriptor
         ]
         best = sorted(range(700), key=distance.__getitem__)[:5]
-        assert found[i] == any(
+        assert is_recalled[i] == any(
             np.linalg.norm(asked.centre[i] - database.centre[j]) < 6.0 for j in best
         )
-    assert 0.05 < found.mean() < 0.95
+    assert 0.05 < is_recalled.mean() < 0.95
 
 
 def test_the_radius_is_at_least_half_a_cell() -> None:
@@ -85,7 +85,7 @@ class Fake(HeldOut):
             yield Street([(kind, place(rng, 200.0 * k)) for kind in ("camera", "lidar")], queries)
 
 
-def lattice(at: Place, is_query: bool) -> np.ndarray:
+def lattice(place: Place, is_query: bool) -> np.ndarray:
     """Centres in voxels: the database every 4, queries every 8 and a little beside."""
     x, y = np.meshgrid(*(np.arange(0, 200, 8 if is_query else 4),) * 2)
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 16)]) + (0.7 if is_query else 0.0)
@@ -95,18 +95,18 @@ def test_a_descriptor_that_knows_its_place_is_always_right_and_a_constant_one_ne
     world = Fake((), SETTINGS, 4000, 50)
     seen: list[int] = []
 
-    def knows(at: Place, is_query: bool) -> Described:
-        centre = lattice(at, is_query)
+    def knows(place: Place, is_query: bool) -> Described:
+        centre = lattice(place, is_query)
         seen.append(len(centre))
         return Described(
-            centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32)
+            centre.astype(np.float32), apply(place.common_T_map, centre * V).astype(np.float32)
         )
 
     assert recalls(world, knows) == dict.fromkeys(DATABASES, 1.0)
     assert sum(seen) > 4000
 
-    def constant(at: Place, is_query: bool) -> Described:
-        centre = lattice(at, is_query)
+    def constant(place: Place, is_query: bool) -> Described:
+        centre = lattice(place, is_query)
         return Described(centre.astype(np.float32), np.ones((len(centre), 3), np.float32))
 
     assert max(recalls(world, constant).values()) < 0.1
@@ -117,23 +117,23 @@ def test_a_chance_descriptor_finds_five_of_all() -> None:
     world = Fake((), SETTINGS, 4000, 10**6)
     rng = np.random.default_rng(0)
 
-    def chance(at: Place, is_query: bool) -> Described:
-        centre = lattice(at, is_query)
+    def chance(place: Place, is_query: bool) -> Described:
+        centre = lattice(place, is_query)
         return Described(
             centre.astype(np.float32), rng.normal(size=(len(centre), 8)).astype(np.float32)
         )
 
-    found = recalls(world, chance)
-    assert max(found.values()) < 0.15
+    recall = recalls(world, chance)
+    assert max(recall.values()) < 0.15
 
 
 def test_the_database_is_cut_to_size_but_keeps_what_is_asked_for() -> None:
     """With no more room than the true places take, every answer is a true one or a neighbour."""
 
-    def knows(at: Place, is_query: bool) -> Described:
-        centre = lattice(at, is_query)
+    def knows(place: Place, is_query: bool) -> Described:
+        centre = lattice(place, is_query)
         return Described(
-            centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32)
+            centre.astype(np.float32), apply(place.common_T_map, centre * V).astype(np.float32)
         )
 
     assert recalls(Fake((), SETTINGS, 1, 5), knows) == dict.fromkeys(DATABASES, 1.0)
@@ -205,9 +205,9 @@ def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
             np.minimum(mapped.query(apply(pose, occupied * V))[0], 1.0).mean() for pose in moved
         )
         assert away < 0.8 * elsewhere, (name, away, elsewhere)
-    found = retrieval_recall(world, NoEncoder())
-    assert set(found) == set(DATABASES)
-    assert all(0 <= v <= 1 for v in found.values())
+    recall = retrieval_recall(world, NoEncoder())
+    assert set(recall) == set(DATABASES)
+    assert all(0 <= v <= 1 for v in recall.values())
     again = held_out(tmp_path, SETTINGS, count, Size(300, 40, extent))
     assert {p: p.stat().st_mtime_ns for p in again.paths} == made  # not simulated twice
     with pytest.raises(SettingsError, match="The held-out towns have"):
@@ -217,9 +217,9 @@ def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
 
 def _comes_back(street: Street, path: Path) -> None:
     write_street(path, street, {})
-    found = read_street(path)
-    pairs = zip([p for _, p in street.database], [p for _, p in found.database], strict=True)
-    for a, b in [*pairs, *zip(street.queries["90"], found.queries["90"], strict=True)]:
+    read = read_street(path)
+    pairs = zip([p for _, p in street.database], [p for _, p in read.database], strict=True)
+    for a, b in [*pairs, *zip(street.queries["90"], read.queries["90"], strict=True)]:
         for name in ("state", "low", "track", "common_T_map"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         assert a.ground_z == b.ground_z
@@ -230,10 +230,10 @@ def _comes_back(street: Street, path: Path) -> None:
 
 def test_everything_alike_has_one_descriptor_for_each_subvolume() -> None:
     windows = np.argwhere(np.ones((3, 2)))
-    found = NoEncoder().describe(np.zeros((64, 56, 32), np.uint8), windows)
-    assert found.shape == (6, 256)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-6)
-    assert (found == found[0, 0]).all()
+    descriptors = NoEncoder().describe(np.zeros((64, 56, 32), np.uint8), windows)
+    assert descriptors.shape == (6, 256)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, rtol=1e-6)
+    assert (descriptors == descriptors[0, 0]).all()
 
 
 def test_the_benchmark_names_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,8 +258,8 @@ def test_the_benchmark_names_its_rows(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_peer_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     state = np.full((40, 40, 40), 253, np.uint8)
     state[:, :, 10] = 0
-    at = Place(state, np.zeros(3, np.int64), 3.0, np.array([[6.0, 6.0, 4.0]]), np.eye(4))
+    place = Place(state, np.zeros(3, np.int64), 3.0, np.array([[6.0, 6.0, 4.0]]), np.eye(4))
     same = network_describes(NoEncoder(), SETTINGS)
     for python, error in ((str(tmp_path / "none"), SettingsError), (sys.executable, SemlocError)):
         with pytest.raises(error, match=r"fpfh|FPFH"):  # this Python has no open3d
-            fpfh_describes(python, tmp_path / "features", [(at, False)], same, V)
+            fpfh_describes(python, tmp_path / "features", [(place, False)], same, V)

@@ -19,8 +19,8 @@ KITTI = ("kitti00_000052", "kitti00_000088", "kitti00_000850", "kitti00_004501")
 
 def test_confusion_by_hand() -> None:
     truth = np.array([0, 1, 9, 2, 4, 8, 8, 5, 7, 13, 11, 255, 255], np.uint8)
-    found = np.array([0, 0, 2, 2, 8, 8, 255, 5, 5, 255, 2, 0, 255], np.uint8)
-    counts = confusion(truth, found)
+    label = np.array([0, 0, 2, 2, 8, 8, 255, 5, 5, 255, 2, 0, 255], np.uint8)
+    counts = confusion(truth, label)
     expected = np.zeros((5, 5), int)
     expected[0] = [2, 1, 0, 0, 0]
     expected[1] = [0, 1, 1, 0, 0]

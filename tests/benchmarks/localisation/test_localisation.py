@@ -121,12 +121,12 @@ def test_full_precision_ends_at_the_best_wrong_answer() -> None:
     assert recall_at_full_precision(answers, []) == pytest.approx(0.4)
     assert recall_at_full_precision(answers, [answer(0.85, np.inf)]) == pytest.approx(0.2)
     assert recall_at_full_precision(answers, [answer(0.9, np.inf)]) == 0.0  # a tie counts as wrong
-    found = figures_of(answers, [answer(0.1, np.inf)])
-    assert found["recall 1 m"] == pytest.approx(0.4)
-    assert found["recall 5 m"] == pytest.approx(0.6)
-    assert found["median error"] == pytest.approx(0.3)
-    assert found["accepted and wrong"] == 3  # 3 m off, 40 m off, and elsewhere
-    assert found["accepted and right"] == pytest.approx(0.4)
+    figures = figures_of(answers, [answer(0.1, np.inf)])
+    assert figures["recall 1 m"] == pytest.approx(0.4)
+    assert figures["recall 5 m"] == pytest.approx(0.6)
+    assert figures["median error"] == pytest.approx(0.3)
+    assert figures["accepted and wrong"] == 3  # 3 m off, 40 m off, and elsewhere
+    assert figures["accepted and right"] == pytest.approx(0.4)
     # its neighbours told it the right one
     promoted = Answer(0, 1.0, 0.9, 40.0, 0.0, True, 0.2, 0.0)
     assert figures_of([promoted], []) == pytest.approx(
@@ -170,15 +170,15 @@ def test_a_grid_has_every_heading_along_and_beside_the_road() -> None:
     context = cast(
         QueryContext, SimpleNamespace(visible=SimpleNamespace(database=database), keyframe=0)
     )
-    found = grid_hypotheses(context)
-    assert len(found) == 5 * 3 * settings.descriptor.headings
-    assert {h.pose[1] for h in found if h.pose[0] < 3} == {0.0, 4.0, 8.0, 12.0, 16.0}
-    assert {h.pose[1] for h in found if h.pose[0] > 3.2} == {2.0, 6.0, 10.0, 14.0, 18.0}
-    assert len({h.pose[0] for h in found}) == settings.descriptor.headings
-    assert {h.pose[2] for h in found} == {-4.0, 0.0, 4.0}
+    hypotheses = grid_hypotheses(context)
+    assert len(hypotheses) == 5 * 3 * settings.descriptor.headings
+    assert {h.pose[1] for h in hypotheses if h.pose[0] < 3} == {0.0, 4.0, 8.0, 12.0, 16.0}
+    assert {h.pose[1] for h in hypotheses if h.pose[0] > 3.2} == {2.0, 6.0, 10.0, 14.0, 18.0}
+    assert len({h.pose[0] for h in hypotheses}) == settings.descriptor.headings
+    assert {h.pose[2] for h in hypotheses} == {-4.0, 0.0, 4.0}
     some = grid_hypotheses(context, count=10)
     assert len(some) == 10
-    assert set(some) <= set(found)
+    assert set(some) <= set(hypotheses)
 
 
 def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
@@ -220,13 +220,13 @@ def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
     )
     allowed = Allowed(np.ones(1, bool))
     query = SimpleNamespace(blocks=blocks)
-    described, found = sweep_words(database, "semantic", allowed, query, 0.0)  # type: ignore[arg-type]
+    described, matches = sweep_words(database, "semantic", allowed, query, 0.0)  # type: ignore[arg-type]
     assert len(described.centre) > 15 * len(known.centre)
-    same = found.distance == 0
+    same = matches.distance == 0
     assert same.sum() >= len(known.centre) > 0
-    assert set(found.yaw[same]) == {0.0}  # the very map: not turned
+    assert set(matches.yaw[same]) == {0.0}  # the very map: not turned
     np.testing.assert_allclose(
-        described.centre[found.query[same]] * 0.3, found.centre[same], atol=1e-4
+        described.centre[matches.query[same]] * 0.3, matches.centre[same], atol=1e-4
     )
 
 
@@ -318,12 +318,12 @@ def test_local_maps_ranks_and_warms_up(tmp_path: Path) -> None:
         "from local_maps import run_pairs, turned\n"
         "run_pairs(lambda c: c, lambda d, q, yaw: (len(d), turned(yaw)))\n"
     )
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, str(script), str(tmp_path / "job.json")],
         capture_output=True,
         text=True,
         check=True,
     ).stdout
-    (query,) = json.loads(said)["queries"]
+    (query,) = json.loads(output)["queries"]
     assert [f[:2] for f in query["found"]] == [[1, 9.0], [0, 5.0]]
     assert np.reshape(query["found"][0][2], (4, 4)) == pytest.approx(yaw_transform(0.5))

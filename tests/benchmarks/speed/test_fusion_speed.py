@@ -87,8 +87,8 @@ def test_depth_images_have_a_point_for_every_pixel_inside_the_room(scans: list[S
 
 def test_sweep_of_a_log_is_seen_from_further_on(shared: Callable[[str], Path]) -> None:
     seen = log_sweeps(shared("logs/kitti00_000052.mcap"), 3)
-    at = np.array([s.map_T_sensor[:3, 3] for s in seen])
-    assert np.linalg.norm(np.diff(at, axis=0), axis=1) == pytest.approx([1.2, 1.2])
+    positions = np.array([s.map_T_sensor[:3, 3] for s in seen])
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1) == pytest.approx([1.2, 1.2])
     assert len(seen[0].points) > 100_000
     assert len(np.unique(seen[0].label)) > 3
 

@@ -55,8 +55,8 @@ def slow_tau(s: Scene, T: F64, every: int) -> float:
 def test_the_ratio_is_the_papers(made: Scene) -> None:
     for h in made.hypotheses[:3]:
         T = pose_matrix(np.array(h.pose))
-        found, _ = tau(made.query.occupied, made.target.blocks, made.target.voxel_size, T, KAPPA)
-        assert found == pytest.approx(slow_tau(made, T, 60), abs=0.08)  # of a sample
+        ratio, _ = tau(made.query.occupied, made.target.blocks, made.target.voxel_size, T, KAPPA)
+        assert ratio == pytest.approx(slow_tau(made, T, 60), abs=0.08)  # of a sample
 
 
 def test_the_search_ranks_first_what_the_paper_ranks_first(made: Scene) -> None:
