@@ -537,9 +537,9 @@ def test_vocabularies_of_both_variants_have_the_shipped_weights_and_shards(tmp_p
     both = ("vocabulary", "--variant", "both", "-o", tmp_path / "v", "--shards", tmp_path)
     assert semloc(*both, "--set", "descriptor.weights=w.safetensors").exit_code == 2
     assert semloc(*both, "-w", tmp_path).exit_code == 2
-    found = semloc(*both)
-    assert found.exit_code == 2
-    assert "no shards of packed pairs" in found.output + found.stderr
+    result = semloc(*both)
+    assert result.exit_code == 2
+    assert "no shards of packed pairs" in result.output + result.stderr
     assert not (tmp_path / "v").exists()
 
 

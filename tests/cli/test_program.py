@@ -376,9 +376,9 @@ def test_an_interrupted_program_cleans_up(
 ) -> None:
     with _sleeping(tmp_path, engine, tasks) as started:
         os.killpg(started.pid, number)  # as a terminal does it: workers get it too
-        _, said = started.communicate()  # until the program and its workers are gone
-        assert started.returncode == code, said
-        assert "Traceback" not in said
+        _, errors = started.communicate()  # until the program and its workers are gone
+        assert started.returncode == code, errors
+        assert "Traceback" not in errors
         assert list((tmp_path / "busy").iterdir()) == []
 
 

@@ -61,7 +61,7 @@ def test_the_columns_of_several_pairs_give_the_alignments_back() -> None:
     names = [list(of_end) for of_end in held.sessions()]
     assert names == [list("bcbc"), list("abaa")]
     assert held.sigma() == pytest.approx([a.sigma for a in (*rows, *others)])
-    assert {pair: mine.tolist() for pair, mine in held.by_pair()} == {
+    assert {pair: rows_of_pair.tolist() for pair, rows_of_pair in held.by_pair()} == {
         ("b", "a"): [0, 2],
         ("c", "b"): [1],
         ("c", "a"): [3],

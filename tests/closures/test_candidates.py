@@ -116,7 +116,7 @@ def test_each_session_has_its_share_whatever_the_others_have(
         return [Hypothesis(int(g), (0.0, 0.0, 0.0, 0.0), 1, 1.0) for g in group[:1]]
 
     monkeypatch.setattr(matching, "pool", pool)
-    found = find_hypotheses(context(settings(hypotheses=most, places=1)))
+    hypotheses = find_hypotheses(context(settings(hypotheses=most, places=1)))
     assert [(groups, n) for groups, _, n in calls] == [([0], most), ([1, 1], most)]
     assert [cell for _, cell, _ in calls] == pytest.approx([2.4, 2.4])
-    assert [h.group for h in found] == [0, 1], "one place in each session"
+    assert [h.group for h in hypotheses] == [0, 1], "one place in each session"

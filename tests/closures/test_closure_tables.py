@@ -132,9 +132,9 @@ def test_closures_as_a_table(n: int, tmp_path: Path) -> None:
     table = read_table(tmp_path / "closures.parquet")
     assert table.schema.equals(contracts.schema("closures"))
     assert read_metadata(tmp_path / "closures.parquet") == {"schema_version": 1}
-    found = read_closures(tmp_path / "closures.parquet")
-    assert len(found) == n
-    for c, row in zip(rows, found, strict=True):
+    closures = read_closures(tmp_path / "closures.parquet")
+    assert len(closures) == n
+    for c, row in zip(rows, closures, strict=True):
         a = c.alignment
         assert (row["query_session"], row["target_session"], row["query_stamp_ns"]) == (
             "a",
@@ -195,7 +195,7 @@ def test_rejections_are_sorted_by_query_then_probability_then_target(tmp_path: P
     for turn in range(len(rows)):
         write_rejected(tmp_path / "rejected.parquet", rows[turn:] + rows[:turn], {})
         table = read_table(tmp_path / "rejected.parquet")
-        found = zip(
+        keys = zip(
             table["query_session"].to_pylist(),
             table["query_stamp_ns"].to_pylist(),
             table["target_session"].to_pylist(),
@@ -203,7 +203,7 @@ def test_rejections_are_sorted_by_query_then_probability_then_target(tmp_path: P
             strict=True,
         )
         expected = [(query, i * SECOND, target, j * SECOND) for query, i, target, j, _ in ordered]
-        assert list(found) == expected
+        assert list(keys) == expected
 
 
 @pytest.mark.parametrize("better", [0, 1])

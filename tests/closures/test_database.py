@@ -165,20 +165,20 @@ def test_a_target_keyframe_is_never_near_the_query_in_time(
     for keyframe in range(60):
         view = visible_to(database, session, keyframe)
         if len(view.keyframes(0)):
-            found = view.nearest_keyframe(0, session.map_T_base[keyframe, :3, 3])
-            assert abs(found - keyframe) >= 30
+            nearest = view.nearest_keyframe(0, session.map_T_base[keyframe, :3, 3])
+            assert abs(nearest - keyframe) >= 30
 
 
 def test_of_two_passes_the_one_that_looks_at_a_place_is_found(
     out_and_back: tuple[Database, SessionMap],
 ) -> None:
     database, session = out_and_back
-    at = session.map_T_base[20, :3, 3]
-    found = everything(database).viewing_keyframe(0, at + VIEW)
-    np.testing.assert_allclose(session.map_T_base[found, :3, 3], at)
-    assert everything(database).viewing_keyframe(0, at + VIEW) != everything(
+    position = session.map_T_base[20, :3, 3]
+    viewing = everything(database).viewing_keyframe(0, position + VIEW)
+    np.testing.assert_allclose(session.map_T_base[viewing, :3, 3], position)
+    assert everything(database).viewing_keyframe(0, position + VIEW) != everything(
         database
-    ).nearest_keyframe(0, at + VIEW)
+    ).nearest_keyframe(0, position + VIEW)
 
 
 def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never_hidden(
@@ -248,12 +248,12 @@ def test_places_of_one_square_share_what_was_seen_from_afar_about_its_centre(
     road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
     drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))])
     seen: list[Any] = []
-    monkeypatch.setattr(target_surface_module, "_surface", lambda found: seen.append(found))
+    monkeypatch.setattr(target_surface_module, "_surface", lambda surface: seen.append(surface))
     for x in (72.1, 76.7, 76.9):  # squares of 4.8 m: 72 to 76.8, and the next
         database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
         target_surface(everything(database), 0, np.array([x, 1.0, -1.0]))
     np.testing.assert_allclose(
-        [found.afar for found in seen],
+        [surface.afar for surface in seen],
         [[74.4, 2.4, -2.4], [74.4, 2.4, -2.4], [79.2, 2.4, -2.4]],
     )
     # half a radius from the last view, 12 m, is not afar
@@ -263,8 +263,8 @@ def test_places_of_one_square_share_what_was_seen_from_afar_about_its_centre(
 
 def test_what_looks_all_around_looks_where_it_is() -> None:
     """At 0.30 m voxels a mean of the points 6 m ahead is a view, one of 5 m is not."""
-    found = view_centres(np.zeros((2, 3)), np.array([[5.9, 0.0, 0.0], [6.1, 0.0, 0.0]]), 0.3)
-    np.testing.assert_allclose(found, [[0.0, 0.0, 0.0], [6.1, 0.0, 0.0]])
+    centres = view_centres(np.zeros((2, 3)), np.array([[5.9, 0.0, 0.0], [6.1, 0.0, 0.0]]), 0.3)
+    np.testing.assert_allclose(centres, [[0.0, 0.0, 0.0], [6.1, 0.0, 0.0]])
 
 
 def test_words_answer_where_the_drive_came_by_at_another_time(
@@ -349,9 +349,9 @@ def test_classes_are_compared_where_both_sides_know_them(
         folder = drive_session(work, name, road, [(0, 20)], [np.zeros((0, 3))]).folder
         write_json(folder.session_json, read_json(folder.session_json) | {"label_source": source})
     database = Database(work, ("a", "b"), Settings().resolved())
-    found = allowed_words(everything(database), SessionMap(work.session("q")))
+    by_variant = allowed_words(everything(database), SessionMap(work.session("q")))
     expected = {"semantic": semantic, "geometric": geometric}
-    assert {variant: allowed.groups.tolist() for variant, allowed in found.items()} == {
+    assert {variant: allowed.groups.tolist() for variant, allowed in by_variant.items()} == {
         k: x for k, x in expected.items() if x
     }
 

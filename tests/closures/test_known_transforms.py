@@ -123,8 +123,8 @@ def write_session(
     for pose in poses:
         some = rng.random(len(points)) < 1 / 3
         seen = apply(inverse(pose), points[some] + rng.normal(0, 0.01, (int(some.sum()), 3)))
-        near = np.linalg.norm(seen - SENSOR, axis=1) < 24
-        clouds.append(Keyframe(seen[near].astype(np.float32), label[some][near]))
+        is_near = np.linalg.norm(seen - SENSOR, axis=1) < 24
+        clouds.append(Keyframe(seen[is_near].astype(np.float32), label[some][is_near]))
     columns: dict[str, Any] = {
         "keyframe": np.arange(n),
         "stamp_ns": np.arange(n) * 10**9,
@@ -320,10 +320,10 @@ def test_a_second_place_that_fits_as_well_is_a_rival(work: Workspace, ask: Ask) 
     """
     here = yaw_transform(1.0, (5.0, 2.0, 0.0))
 
-    def probabilities(found: list[Alignment]) -> list[float]:
-        names = {a.query_session for a in found} | {a.target_session for a in found}
+    def probabilities(alignments: list[Alignment]) -> list[float]:
+        names = {a.query_session for a in alignments} | {a.target_session for a in alignments}
         maps = {name: SessionMap(work.session(name)) for name in names}
-        return [o.decision.probability for o in decide(found, maps, SETTINGS)]
+        return [o.decision.probability for o in decide(alignments, maps, SETTINGS)]
 
     alone = probabilities(ask(here))
     first, second = ask(here, "twice")[:2]
@@ -381,17 +381,19 @@ def test_a_near_word_outweighs_several_far_ones(
     visible = everything(database)
     allowed = allowed_words(visible, session)["semantic"]
     described, _ = match_words(database, "semantic", allowed, query, 0.0)
-    found = find_hypotheses(QueryContext(visible, session, 2, query, query_T_base))
-    assert [round(h.weight, 6) for h in found] == [1.001] * 4 + [round(3 * (1 / 64 + 0.001), 6)] * 4
-    assert [h.votes for h in found] == [1] * 4 + [3] * 4
-    assert sorted(h.pose[0] for h in found[:4]) == pytest.approx(
+    hypotheses = find_hypotheses(QueryContext(visible, session, 2, query, query_T_base))
+    assert [round(h.weight, 6) for h in hypotheses] == [1.001] * 4 + [
+        round(3 * (1 / 64 + 0.001), 6)
+    ] * 4
+    assert [h.votes for h in hypotheses] == [1] * 4 + [3] * 4
+    assert sorted(h.pose[0] for h in hypotheses[:4]) == pytest.approx(
         [0.25 + k * np.pi / 2 for k in range(4)]
     )
-    for h in found:  # the query word lies on the map word
-        at = apply(
+    for h in hypotheses:  # the query word lies on the map word
+        centre_in_map = apply(
             yaw_transform(h.pose[0], np.array(h.pose[1:])), described.centre[:1].astype(float) * V
         )[0]
-        np.testing.assert_allclose(at, one if h.votes == 1 else several, atol=1e-6)
+        np.testing.assert_allclose(centre_in_map, one if h.votes == 1 else several, atol=1e-6)
 
 
 def fitted(score: float, x: float = 0.0, degrees: float = 0.0) -> Fitted:

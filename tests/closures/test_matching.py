@@ -82,16 +82,16 @@ def between(evaluation: Evaluation, one: str, other: str) -> list[Judged]:
 def test_a_camera_that_sees_a_quarter_finds_itself_in_the_map_of_a_lidar(
     evaluation: Evaluation,
 ) -> None:
-    found = between(evaluation, "camera", "map")
-    assert len(found) >= 8
-    assert np.median([c.error_m for c in found if c.error_m is not None]) < 0.2
+    closures = between(evaluation, "camera", "map")
+    assert len(closures) >= 8
+    assert np.median([c.error_m for c in closures if c.error_m is not None]) < 0.2
 
 
 def test_frames_without_poses_find_themselves_one_by_one(evaluation: Evaluation) -> None:
-    found = between(evaluation, "frames", "map")
-    assert len(found) >= 8
+    closures = between(evaluation, "frames", "map")
+    assert len(closures) >= 8
     # their sweeps are as skewed as they were driven
-    assert np.median([c.error_m for c in found if c.error_m is not None]) < 0.5
+    assert np.median([c.error_m for c in closures if c.error_m is not None]) < 0.5
 
 
 def test_nothing_else_is_said(evaluation: Evaluation) -> None:

@@ -32,7 +32,7 @@ def alignment(keyframe: int, contradiction: float) -> Any:
 
 def searched(
     votes: Mapping[int, Votes],
-    found: Mapping[int, Any],
+    alignments: Mapping[int, Any],
     least: float,
     *,
     is_other: bool = True,
@@ -42,10 +42,10 @@ def searched(
 
     def search(keyframe: int, least_agreement: float = 0.0) -> list[Any]:
         order.append(keyframe)
-        return [found[keyframe]] if keyframe in found else []
+        return [alignments[keyframe]] if keyframe in alignments else []
 
     out = _search_block(BLOCK, votes, least, search, is_other=is_other)
-    assert out == [found[keyframe] for keyframe in order if keyframe in found]
+    assert out == [alignments[keyframe] for keyframe in order if keyframe in alignments]
     return order
 
 
@@ -61,8 +61,8 @@ def votes(*places: float, everywhere: float = 100.0, submaps: int = 12) -> dict[
 def test_the_others_are_searched_where_the_best_one_finds_a_place(
     contradiction: float, expected: list[int]
 ) -> None:
-    found = {14: alignment(14, contradiction)}
-    assert searched(votes(0.5, 4.0, 5.0, 5.0), found, MIN_VOTES) == expected
+    alignments = {14: alignment(14, contradiction)}
+    assert searched(votes(0.5, 4.0, 5.0, 5.0), alignments, MIN_VOTES) == expected
 
 
 def test_a_block_without_votes_is_not_searched() -> None:
@@ -168,9 +168,9 @@ def searches_of(
         # too contradicting to be worth the vote of a neighbour
         return [SimpleNamespace(**vars(alignment(keyframe, 0.4)), target_session=target)]
 
-    def write(output: Path, keyframes: Any, targets: Any, found: list[Any]) -> None:
+    def write(output: Path, keyframes: Any, targets: Any, alignments: list[Any]) -> None:
         assert (output, keyframes, targets) == (task.output, task.keyframes, task.targets)
-        written.extend(found)
+        written.extend(alignments)
 
     stand_ins = {
         "SessionMap": lambda folder: folder.name,
@@ -192,8 +192,8 @@ def test_alignments_are_written_by_query_and_then_by_target(
 ) -> None:
     task = task_of(tmp_path, (4, 8), ["b", "a"], closures__every="4", query__every="4")
     many = Votes(50.0, 100.0, 12)
-    found = searches_of(task, monkeypatch, {k: {"a": many, "b": many} for k in (4, 8)})
-    assert found == [("a", 4), ("b", 4), ("a", 8), ("b", 8)]
+    written = searches_of(task, monkeypatch, {k: {"a": many, "b": many} for k in (4, 8)})
+    assert written == [("a", 4), ("b", 4), ("a", 8), ("b", 8)]
 
 
 def test_chance_counts_in_another_session_and_not_in_its_own(
@@ -284,8 +284,8 @@ def test_a_survey_gets_words_in_metres_of_queries_with_structure(
         for keyframe, voxels in ((4, 2), (8, 0))
     }
     session: Any = SimpleNamespace(has_classes=True)
-    found = search_tasks.survey_queries(task, session, queries)
-    assert found == {4: {"b": of_b} | ({"own": of_own} if with_own else {}), 8: {}}
+    words_of_queries = search_tasks.survey_queries(task, session, queries)
+    assert words_of_queries == {4: {"b": of_b} | ({"own": of_own} if with_own else {}), 8: {}}
 
 
 def test_a_session_without_others_needs_no_survey(

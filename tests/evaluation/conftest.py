@@ -31,8 +31,8 @@ def _judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
     town = np.array([f"t{k % towns}" for k in range(n)], object)
     query = np.arange(n) // towns
     own = np.array([yaw_transform(0.0, (2.0 * k, 0.0, 0.0)) for k in query])
-    at = own.copy()
-    at[~right, :2, 3] += rng.uniform(20, 90, (int((~right).sum()), 2))
+    target_T_query = own.copy()
+    target_T_query[~right, :2, 3] += rng.uniform(20, 90, (int((~right).sum()), 2))
     road = np.array(2.0 * query, float)
     a, b = (np.full(n, name, object) for name in ("a", "b"))
     placed = Placed(
@@ -42,7 +42,7 @@ def _judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
         road,
         road.copy(),
         own,
-        at,
+        target_T_query,
         np.full(n, 0.02),
         np.zeros(n),
         np.ones(n, bool),

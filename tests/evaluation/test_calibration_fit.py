@@ -49,7 +49,9 @@ def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere(judged: 
     copy = np.arange(n) % 2 == 1
     query = np.arange(n) % (n // 2) // 2
     own = np.array([yaw_transform(0.0, (2.0 * k, 0.0, 0.0)) for k in query])
-    at = own @ np.where(copy[:, None, None], yaw_transform(0.0, (85.0, 0.0, 0.0)), np.eye(4))
+    target_T_query = own @ np.where(
+        copy[:, None, None], yaw_transform(0.0, (85.0, 0.0, 0.0)), np.eye(4)
+    )
     road = np.array(2.0 * query, float)
     a, b = (np.full(n, name, object) for name in ("a", "b"))
     placed = Placed(
@@ -59,7 +61,7 @@ def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere(judged: 
         road,
         road + 85.0 * copy,
         own,
-        at,
+        target_T_query,
         np.full(n, 0.02),
         np.zeros(n),
         np.ones(n, bool),
@@ -97,12 +99,12 @@ def test_what_is_said_of_a_town_does_not_depend_on_its_truth(judged: Make) -> No
     lied[data.town == "t1"] ^= True
     before = fit(data)
     after = fit(replace(data, right=lied))
-    mine = data.town == "t1"
+    is_of_town = data.town == "t1"
     # tempering looks at all towns; the models of the other towns order the alignments of a town,
     # apart from the most certain ones, which are equally certain
-    certain = [f.alone[mine] > f.alone[mine].max() - 1e-6 for f in (before, after)]
+    certain = [f.alone[is_of_town] > f.alone[is_of_town].max() - 1e-6 for f in (before, after)]
     below = ~(certain[0] | certain[1])
-    order = [np.argsort(f.alone[mine][below]).tolist() for f in (before, after)]
+    order = [np.argsort(f.alone[is_of_town][below]).tolist() for f in (before, after)]
     assert below.sum() > 100
     assert order[0] == order[1]
 

@@ -96,13 +96,13 @@ def test_a_town_is_judged_into_a_table_and_read_back(judge: Any) -> None:
 def test_squared_errors_over_their_covariance_by_hand(judge: Any) -> None:
     """20 cm along x is two standard deviations, 20 cm across 0.4 of one, 0.02 rad two."""
     true = inverse(ROAD[2]) @ ROAD[1]
-    found = []
+    alignments = []
     for off, turn in (((0.2, 0, 0), 0.0), ((0, 0.2, 0), 0.0), ((0, 0, 0), 0.02)):
         T = true.copy()
         T[:3, 3] += off
         T[:3, :3] = Rotation.from_rotvec([0, 0, turn]).as_matrix() @ T[:3, :3]
-        found.append(alignment(T))
-    back = read_judged([judge(*found)])
+        alignments.append(alignment(T))
+    back = read_judged([judge(*alignments)])
     np.testing.assert_allclose(back.nees_position, [4.0, 0.16, 0.0], atol=1e-5)
     np.testing.assert_allclose(back.nees_pose, [4.0, 0.16, 4.0], atol=1e-5)
 

@@ -12,10 +12,10 @@ from semloc_logs.numerics.transforms import exp_se3
 F64 = NDArray[np.float64]
 
 
-def wall(at: float, seed: int) -> F64:
+def wall(x: float, seed: int) -> F64:
     """Points (n, 3) of a wall of 4 x 4 m across x."""
     rng = np.random.default_rng(seed)
-    return np.column_stack([np.full(4000, at), rng.uniform(0, 4, (4000, 2))])
+    return np.column_stack([np.full(4000, x), rng.uniform(0, 4, (4000, 2))])
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.1])

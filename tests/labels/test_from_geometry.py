@@ -47,13 +47,13 @@ def test_a_street_and_a_room_in_its_shape(slope: float, scale: float) -> None:
     parts = street(np.random.default_rng(0), slope)
     points = np.concatenate(list(parts.values())) * scale
     truth = np.concatenate([np.full(len(p), k) for k, p in parts.items()])
-    found = classify(points, np.array([0, 0, 1.8]) * scale, scale)
-    share = {k: float((found[truth == k] == k).mean()) for k in parts}
+    label = classify(points, np.array([0, 0, 1.8]) * scale, scale)
+    share = {k: float((label[truth == k] == k).mean()) for k in parts}
     assert share[ROAD] > 0.97
     assert share[BUILDING] > 0.9
     assert share[POLE] > 0.85
     assert share[VEGETATION] > 0.8
-    wrong_ground = (found == ROAD) & (truth != ROAD)
+    wrong_ground = (label == ROAD) & (truth != ROAD)
     assert wrong_ground.sum() < 0.01 * len(points)
 
 
@@ -61,9 +61,9 @@ def test_points_far_away_and_in_odd_places_are_unlabelled_and_cost_no_memory() -
     rng = np.random.default_rng(0)
     ground = rng.uniform((-5, -5, 0), (5, 5, 0.02), (500, 3))
     points = np.concatenate([ground, [[1e7, -1e7, 3.0], [0.0, 0.0, 1e30]]])
-    found = classify(points, np.array([0, 0, 1.8]))
-    assert (found[:500] == ROAD).all()
-    assert found[500:].tolist() == [UNLABELLED, UNLABELLED]
+    label = classify(points, np.array([0, 0, 1.8]))
+    assert (label[:500] == ROAD).all()
+    assert label[500:].tolist() == [UNLABELLED, UNLABELLED]
 
 
 def test_no_points_and_few_points() -> None:
@@ -79,20 +79,20 @@ def test_classes_do_not_depend_on_the_order_of_points_or_on_where_the_map_begins
     rng = np.random.default_rng(3)
     points = np.concatenate(list(street(rng).values()))
     origin = np.array([0, 0, 1.8])
-    found = classify(points, origin)
+    label = classify(points, origin)
     turned = rng.permutation(len(points))
-    assert (classify(points[turned], origin) == found[turned]).mean() > 0.999
+    assert (classify(points[turned], origin) == label[turned]).mean() > 0.999
     away = np.array([600.0, -300.0, 30.0])  # whole voxels and cells
-    assert (classify(points + away, origin + away) == found).mean() > 0.999
+    assert (classify(points + away, origin + away) == label).mean() > 0.999
 
 
 def slow_shape(
     points: F64, i: int, neighbours: int, radius: float
 ) -> tuple[F64, F64, float, float, float]:
     distance = np.linalg.norm(points - points[i], axis=1)
-    near = np.argsort(distance, kind="stable")[:neighbours]
-    near = near[distance[near] < radius]
-    values, vectors = np.linalg.eigh(np.cov(points[near].T, bias=True))
+    nearest = np.argsort(distance, kind="stable")[:neighbours]
+    nearest = nearest[distance[nearest] < radius]
+    values, vectors = np.linalg.eigh(np.cov(points[nearest].T, bias=True))
     s = np.sqrt(np.maximum(values, 0))
     return vectors[:, 0], vectors[:, 2], (s[2] - s[1]) / s[2], (s[1] - s[0]) / s[2], s[0] / s[2]
 

@@ -137,10 +137,10 @@ def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], 
 
 def test_the_log_names_the_meaning_of_its_ids() -> None:
     names = {0: "unlabeled", 1: "Tree", 2: "street", 3: "quux"}
-    found, labeller = classes(
+    labels, labeller = classes(
         [LabelNames(header("/lidar/label_info", 0), names=names), sweep(10, [1, 2, 3])]
     )
-    assert found == [[8, ROAD, 255]]
+    assert labels == [[8, ROAD, 255]]
     assert labeller.to_json()["spaces"]["/lidar/points"] == {
         "space": "/lidar/label_info",
         "said_by": "log",
@@ -154,12 +154,12 @@ def test_the_log_names_the_meaning_of_its_ids() -> None:
 def test_a_space_that_the_log_names_instead_of_a_guess() -> None:
     ids = [7, 8, 11]  # looks like the full ids, and is named train ids
     named = LabelNames(header("/lidar/label_space", 0), space="cityscapes")
-    found, labeller = classes([named, sweep(10, ids)])
-    assert found == [[7, 8, 11]]
+    labels, labeller = classes([named, sweep(10, ids)])
+    assert labels == [[7, 8, 11]]
     assert labeller.to_json()["spaces"]["/lidar/points"]["said_by"] == "log"
-    found, _ = classes([named, sweep(10, ids)], space="cityscapes_ids")
-    assert found == [[ROAD, 1, BUILDING]]
-    found, labeller = classes(
+    labels, _ = classes([named, sweep(10, ids)], space="cityscapes_ids")
+    assert labels == [[ROAD, 1, BUILDING]]
+    labels, labeller = classes(
         [LabelNames(header("/lidar/label_space", 0), space="/etc/passwd.yaml"), sweep(10, ids)]
     )
     assert labeller.to_json()["spaces"]["/lidar/points"] == {
@@ -170,8 +170,8 @@ def test_a_space_that_the_log_names_instead_of_a_guess() -> None:
 
 
 def test_a_guess_looks_at_all_keyframes_and_is_recorded() -> None:
-    found, labeller = classes([sweep(10, [0, 10, 10]), sweep(200, [40, 40, 50])])
-    assert found == [[255, CAR, CAR], [ROAD, ROAD, BUILDING]]
+    labels, labeller = classes([sweep(10, [0, 10, 10]), sweep(200, [40, 40, 50])])
+    assert labels == [[255, CAR, CAR], [ROAD, ROAD, BUILDING]]
     assert labeller.source == "log"
     assert labeller.to_json()["spaces"]["/lidar/points"] == {
         "space": "semantickitti",
@@ -203,7 +203,7 @@ def test_ids_that_the_label_space_of_the_log_does_not_have_are_not_classes() -> 
 
 def test_ids_that_no_label_space_has_are_not_classes() -> None:
     numbers = [sweep(10 * k, [101 + k, 230 - k, 77]) for k in range(1, 5)]
-    found, labeller = classes(numbers)
+    labels, labeller = classes(numbers)
     assert labeller.source == "geometry"
     assert labeller.to_json()["spaces"] == {}
     [problem] = labeller.problems
@@ -215,9 +215,9 @@ def test_ids_that_no_label_space_has_are_not_classes() -> None:
     )
     # the user knows better
     for given in ({"source": "log"}, {"space": "semantickitti"}):
-        found, labeller = classes(numbers, **given)
+        labels, labeller = classes(numbers, **given)
         assert labeller.source == "log"
-        assert found == [[255, 255, 255]] * 4
+        assert labels == [[255, 255, 255]] * 4
         assert not any(p.assumed for p in labeller.problems)
 
 
@@ -230,22 +230,22 @@ def test_label_images_are_painted_onto_the_lidar() -> None:
         halves(100, 13, 13),
         sweep(100),
     ]
-    found, labeller = classes(frames)
-    assert found == [[POLE, BUILDING, 255], [CAR, CAR, 255]]
+    labels, labeller = classes(frames)
+    assert labels == [[POLE, BUILDING, 255], [CAR, CAR, 255]]
     content = labeller.to_json()
     assert content["points"] == {"seen": 6, "in_a_picture": 4, "painted": 4}
     assert content["spaces"]["/cam/labels"]["space"] == "cityscapes"
     filled, _ = classes(frames, unseen="geometry")
-    assert [row[:2] for row in filled] == [row[:2] for row in found]
+    assert [row[:2] for row in filled] == [row[:2] for row in labels]
 
 
 def test_colours_and_those_that_the_palette_does_not_have() -> None:
     road = (128, 64, 128)
     odd = (1, 2, 3)
-    found, labeller = classes(
+    labels, labeller = classes(
         [static(), camera(), halves(0, road, odd), sweep(0), halves(100, road, road), sweep(100)]
     )
-    assert found == [[ROAD, 255, 255], [ROAD, ROAD, 255]]
+    assert labels == [[ROAD, 255, 255], [ROAD, ROAD, 255]]
     assert labeller.to_json()["spaces"]["/cam/labels"] == {
         "space": "cityscapes",
         "said_by": "guess",
@@ -259,10 +259,10 @@ def test_colours_and_those_that_the_palette_does_not_have() -> None:
 
 
 def test_without_poses_the_picture_has_to_be_of_the_same_time() -> None:
-    found, _ = classes(
+    labels, _ = classes(
         [static(), camera(), halves(0, 5, 2), sweep(40), sweep(70), halves(200, 13, 13), sweep(190)]
     )
-    assert found == [[POLE, BUILDING, 255], [255, 255, 255], [CAR, CAR, 255]]
+    assert labels == [[POLE, BUILDING, 255], [255, 255, 255], [CAR, CAR, 255]]
 
 
 def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
@@ -283,8 +283,8 @@ def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
         halves(400, 5, 2),
         sweep(150, points=points),
     ]
-    found, _ = classes(frames)
-    assert found == [[POLE, POLE]]  # at 13.5 degrees to the left in the first picture
+    labels, _ = classes(frames)
+    assert labels == [[POLE, POLE]]  # at 13.5 degrees to the left in the first picture
     still = [
         PoseSample(header("/odom", ms, "odom"), "base_link", np.eye(4)) for ms in range(0, 420, 10)
     ]
@@ -296,8 +296,8 @@ def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
         halves(400, 5, 2),
         sweep(150, points=points),
     ]
-    found, _ = classes(stood)
-    assert found == [[POLE, BUILDING]]
+    labels, _ = classes(stood)
+    assert labels == [[POLE, BUILDING]]
 
 
 def test_two_cameras() -> None:
@@ -310,8 +310,8 @@ def test_two_cameras() -> None:
         sweep(0),
     ]
     frames += [halves(0, 5, 2), halves(0, 13, 13, "/rear/labels", "rear")]
-    found, labeller = classes(frames)
-    assert found == [[POLE, BUILDING, CAR]]
+    labels, labeller = classes(frames)
+    assert labels == [[POLE, BUILDING, CAR]]
     assert [c["points"] for c in labeller.to_json()["cameras"].values()] == [2, 1]
 
 
@@ -337,10 +337,10 @@ def test_painted_points_have_the_number_of_their_camera() -> None:
 
 
 def test_cameras_that_cannot_be_placed_are_named() -> None:
-    found, labeller = classes([camera(), halves(0, 5, 2), sweep(0)])
+    labels, labeller = classes([camera(), halves(0, 5, 2), sweep(0)])
     assert labeller.source == "geometry"
     assert "No transform connects the camera frame 'optical'" in sentences(labeller.problems)[0]
-    assert len(found) == 1
+    assert len(labels) == 1
 
 
 # -- the model of the user
@@ -370,8 +370,8 @@ def by_brightness(folder: Path, rows: int, columns: int) -> dict[str, Any]:
 def test_the_model_labels_the_points_in_the_picture(tmp_path: Path) -> None:
     settings = by_brightness(tmp_path, 100, 100)
     picture = halves(0, (200, 200, 200), (10, 10, 10), "/cam/image")
-    found, labeller = classes([static(), camera(), picture, sweep(0, [40, 40, 40])], **settings)
-    assert found == [[BUILDING, CAR, 255]]  # whatever labels the points have
+    labels, labeller = classes([static(), camera(), picture, sweep(0, [40, 40, 40])], **settings)
+    assert labels == [[BUILDING, CAR, 255]]  # whatever labels the points have
     assert labeller.source == "onnx"
     assert labeller.to_json()["model"]["unknown_classes"] == []
 
@@ -405,10 +405,10 @@ def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Pat
     finally:
         session.close()
     labeller.conclude(lambda _: KeyframeView(cloud.points, ORIGIN, ids, False), 1.0)
-    found = labeller.labels(0, cloud.points, ORIGIN, ids, 1.0)
+    labels = labeller.labels(0, cloud.points, ORIGIN, ids, 1.0)
     behind = cloud.points[:, 0] < 0
-    assert (found[behind] == 255).all()
-    assert set(np.unique(found)) == {BUILDING, CAR, 255}
+    assert (labels[behind] == 255).all()
+    assert set(np.unique(labels)) == {BUILDING, CAR, 255}
     content = labeller.to_json()["points"]
     assert 14_000 < content["in_a_picture"] < 18_000
     assert 0.6 < content["painted"] / content["in_a_picture"] < 1.0

@@ -112,7 +112,7 @@ def test_a_board_before_a_wall(offset: tuple[float, float, float], rings: float)
     distance, truth = seen(np.zeros(3), directions)
     points = directions[truth > 0] * distance[truth > 0, None]
     truth = truth[truth > 0]
-    found, _, inside = painted(points, without_borders(picture(base_T_camera), 2), base_T_camera)
+    label, _, inside = painted(points, without_borders(picture(base_T_camera), 2), base_T_camera)
     # what the camera sees: the first thing on its line to the point is the point itself
     lines = points - base_T_camera[:3, 3]
     is_visible = seen(base_T_camera[:3, 3], lines)[0] > 1 - 1e-6
@@ -121,12 +121,12 @@ def test_a_board_before_a_wall(offset: tuple[float, float, float], rings: float)
     )
     hidden = inside & ~is_visible & (truth == WALL)
     assert hidden.sum() > (20 if rings < 1 else 3)  # otherwise there is nothing to test
-    bleeding = inside & (truth == WALL) & (found == BOARD)
+    bleeding = inside & (truth == WALL) & (label == BOARD)
     naive = inside & (truth == WALL) & (picture(base_T_camera)[_pixel(pixels)] == BOARD)
     assert naive.sum() >= hidden.sum()
     assert bleeding.sum() <= 0.02 * naive.sum()
-    assert (found[hidden] == UNPAINTED).mean() > 0.95
-    assert not (inside & (truth == BOARD) & (found == WALL)).any()
+    assert (label[hidden] == UNPAINTED).mean() > 0.95
+    assert not (inside & (truth == BOARD) & (label == WALL)).any()
     # away from the board's silhouette nearly everything is painted, as what it is
     silhouette = np.abs(
         _angles(points, base_T_camera) - _board_middle(base_T_camera)
@@ -136,7 +136,7 @@ def test_a_board_before_a_wall(offset: tuple[float, float, float], rings: float)
         & is_visible
         & ((silhouette > np.radians(0.7)).any(1) | (silhouette < -np.radians(0.4)).all(1))
     )
-    assert (found[clear] == truth[clear]).mean() > 0.985
+    assert (label[clear] == truth[clear]).mean() > 0.985
 
 
 def _pixel(pixels: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -165,9 +165,9 @@ def test_a_lidar_on_its_side() -> None:
     points = turned[truth > 0] * distance[truth > 0, None]
     truth = truth[truth > 0]
     labels = without_borders(picture(base_T_camera), 2)
-    found, _, inside = painted(points, labels, base_T_camera, axis=np.array([0.0, 1.0, 0.0]))
-    assert (found[inside & (truth == WALL)] == BOARD).mean() < 0.002
-    assert (found[inside] == truth[inside]).mean() > 0.9
+    label, _, inside = painted(points, labels, base_T_camera, axis=np.array([0.0, 1.0, 0.0]))
+    assert (label[inside & (truth == WALL)] == BOARD).mean() < 0.002
+    assert (label[inside] == truth[inside]).mean() > 0.9
 
 
 @pytest.mark.parametrize("offset", [(0.3, 0.3, -0.3), (1.5, 0.0, -0.3)])
@@ -179,9 +179,9 @@ def test_the_ground_and_a_wall_along_the_road_do_not_hide_themselves(
     wall = 4.0 / np.maximum(directions[:, 1], 1e-9)
     distance = np.minimum(ground, wall)
     points = (directions * distance[:, None])[distance < 45]
-    found, _, inside = painted(points, np.zeros((HEIGHT, WIDTH), np.uint32), camera_at(*offset))
+    label, _, inside = painted(points, np.zeros((HEIGHT, WIDTH), np.uint32), camera_at(*offset))
     assert inside.sum() > 10_000
-    assert (found[inside] == 0).mean() > 0.97
+    assert (label[inside] == 0).mean() > 0.97
 
 
 def test_points_behind_a_window_are_doubtful() -> None:
@@ -215,13 +215,13 @@ def test_points_behind_a_window_are_doubtful() -> None:
 
 def test_points_behind_beside_and_without_any_company() -> None:
     points = np.array([[-5.0, 0, 0], [5.0, 0, 0], [5.0, 30.0, 0]])
-    found, _, inside = painted(points, np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0))
+    label, _, inside = painted(points, np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0))
     assert inside.tolist() == [False, True, False]
-    assert found.tolist() == [UNPAINTED, 7, UNPAINTED]
-    found, _, inside = painted(
+    assert label.tolist() == [UNPAINTED, 7, UNPAINTED]
+    label, _, inside = painted(
         np.zeros((0, 3)), np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0)
     )
-    assert len(found) == len(inside) == 0
+    assert len(label) == len(inside) == 0
 
 
 def test_borders_by_hand() -> None:

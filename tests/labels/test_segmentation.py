@@ -93,9 +93,9 @@ def stripes(rows: int = 8, columns: int = 16) -> Pixels:
 
 def test_classes_by_colour(tmp_path: Path) -> None:
     segmenter = opened(tmp_path)
-    found = segmenter.train_ids(stripes())
-    assert found[3].tolist() == [ROAD] * 5 + [VEGETATION] * 5 + [CAR] * 6
-    np.testing.assert_array_equal(found, segmenter.train_ids(stripes()))
+    ids = segmenter.train_ids(stripes())
+    assert ids[3].tolist() == [ROAD] * 5 + [VEGETATION] * 5 + [CAR] * 6
+    np.testing.assert_array_equal(ids, segmenter.train_ids(stripes()))
     assert segmenter.to_json()["runtime"].startswith("onnxruntime")
 
 
@@ -163,17 +163,17 @@ def test_pictures_of_other_sizes_come_back_in_their_own(tmp_path: Path) -> None:
 
 
 def test_crop_and_ignore(tmp_path: Path) -> None:
-    found = opened(
+    ids = opened(
         tmp_path, input={"size": [8, 16], "crop": [0.25, 0.5, 0, 0]}, ignore=["car", 1]
     ).train_ids(stripes())
-    assert (found[:2] == UNPAINTED).all()
-    assert (found[4:] == UNPAINTED).all()
-    assert found[2, ::5].tolist() == [ROAD, 255, 255, 255]
+    assert (ids[:2] == UNPAINTED).all()
+    assert (ids[4:] == UNPAINTED).all()
+    assert ids[2, ::5].tolist() == [ROAD, 255, 255, 255]
 
 
 def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
-    found = opened(tmp_path, {"classes": 19}, classes=None, space="cityscapes").train_ids(stripes())
-    assert found[0, ::5].tolist() == [0, 1, 2, 2]
+    ids = opened(tmp_path, {"classes": 19}, classes=None, space="cityscapes").train_ids(stripes())
+    assert ids[0, ::5].tolist() == [0, 1, 2, 2]
     (tmp_path / "mine.yaml").write_text(
         "classes: {0: {name: a, to: pole}, 1: {name: b, to: null}, 2: {name: fence}}"
     )

@@ -201,10 +201,10 @@ def test_colours_that_the_palette_does_not_have_are_counted() -> None:
     road = 128 << 16 | 64 << 8 | 128
     car = 142
     strange = 0x010203
-    found, unknown = read_space("cityscapes").train_ids_of_colours(
+    ids, unknown = read_space("cityscapes").train_ids_of_colours(
         np.array([[road, car, strange], [strange, 0, UNPAINTED]], np.uint32)
     )
-    assert found.tolist() == [[0, 13, 255], [255, 255, 255]]
+    assert ids.tolist() == [[0, 13, 255], [255, 255, 255]]
     assert unknown == {strange: 2}
 
 

@@ -16,11 +16,11 @@ from semloc_logs.closures.acceptance.placements import Placed
 
 
 def test_things_about_a_road_are_counted_to_both_ends_of_the_reach() -> None:
-    at = np.array([30.0, 0.0, 10.0, 20.0, 20.0])
+    places = np.array([30.0, 0.0, 10.0, 20.0, 20.0])
     road = np.array([0.0, 15.0, 20.0, 30.0, 99.0])
-    assert _about(at, road, 10.0).tolist() == [2, 3, 4, 3, 0]
+    assert _about(places, road, 10.0).tolist() == [2, 3, 4, 3, 0]
     shares = np.array([1.0, 0.5, 0.25, 0.125, 0.0625])
-    assert _about(at, road, 5.0, shares).tolist() == [0.5, 0.4375, 0.1875, 1.0, 0.0]
+    assert _about(places, road, 5.0, shares).tolist() == [0.5, 0.4375, 0.1875, 1.0, 0.0]
 
 
 def test_the_nearest_of_ascending_values_and_the_first_of_two() -> None:
@@ -68,8 +68,8 @@ def test_a_contradiction_with_a_lone_query_is_not_counted_along_the_road(
     monkeypatch.setattr(ambiguity_module, "_contradictions", lambda *_: triple)
     rows = placed(["a", "a", "b"], ["b", "c", "c"], 0.0)
     roads = {name: np.array([50.0]) for name in "abc"}
-    found = ambiguity(rows, {}, roads, np.zeros(3), np.array(lone), 0.3)
-    assert found.tolist() == expected
+    counts = ambiguity(rows, {}, roads, np.zeros(3), np.array(lone), 0.3)
+    assert counts.tolist() == expected
 
 
 @pytest.mark.parametrize(

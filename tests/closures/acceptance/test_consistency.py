@@ -91,21 +91,21 @@ def alignment(
     error: F64 | None = None,
     query: str = "a",
     target: str = "b",
-    at: int | None = None,
+    target_keyframe: int | None = None,
 ) -> Alignment:
     """Query ``k`` aligned at the true place, or moved by ``error`` in the target's map; or at
-    keyframe ``at`` of the target.
+    ``target_keyframe``.
     """
-    at = k if at is None else at
-    moved = (np.eye(4) if error is None else error) @ MAPS[target].map_T_base[at]
+    target_keyframe = k if target_keyframe is None else target_keyframe
+    moved = (np.eye(4) if error is None else error) @ MAPS[target].map_T_base[target_keyframe]
     return Alignment(
         query,
         target,
         k,
-        at,
+        target_keyframe,
         k,
-        at,
-        inverse(MAPS[target].map_T_base[at]) @ moved,
+        target_keyframe,
+        inverse(MAPS[target].map_T_base[target_keyframe]) @ moved,
         np.eye(6) * 1e-4,
         0.8,
         900,
@@ -132,10 +132,10 @@ def sentence(outcome: Outcome) -> str:
 
 
 def test_neighbours_of_one_transform_agree_and_are_counted_by_hand() -> None:
-    found = decided([alignment(k, 0.5) for k in range(20, 31)])
-    middle = found[25, 25].decision.agreement
+    outcomes = decided([alignment(k, 0.5) for k in range(20, 31)])
+    middle = outcomes[25, 25].decision.agreement
     assert (middle.neighbours, round(middle.support, 9), middle.conflict) == (10, 5.0, 0.0)
-    assert found[20, 20].decision.agreement.neighbours == 10  # all within 25 m of road
+    assert outcomes[20, 20].decision.agreement.neighbours == 10  # all within 25 m of road
     far = decided([alignment(k, 0.5) for k in (10, 30, 50)])[30, 30].decision.agreement
     assert (far.neighbours, far.support, round(far.far_support, 9)) == (0, 0.0, 1.0)
 
@@ -143,12 +143,12 @@ def test_neighbours_of_one_transform_agree_and_are_counted_by_hand() -> None:
 def test_one_that_lies_elsewhere_opposes_and_is_opposed() -> None:
     moved = yaw_transform(0.0, (8.0, 0.0, 0.0))
     rows = [alignment(k, 0.9, moved if k == 25 else None) for k in range(20, 31)]
-    found = decided(rows)
-    assert found[25, 25].decision.agreement.conflict == pytest.approx(9.0)
-    assert found[25, 25].decision.agreement.support == 0.0
-    assert found[24, 24].decision.agreement.conflict == pytest.approx(0.9)
-    assert found[24, 24].decision.agreement.support == pytest.approx(0.9 * 9)
-    assert found[25, 25].decision.probability < found[24, 24].decision.probability
+    outcomes = decided(rows)
+    assert outcomes[25, 25].decision.agreement.conflict == pytest.approx(9.0)
+    assert outcomes[25, 25].decision.agreement.support == 0.0
+    assert outcomes[24, 24].decision.agreement.conflict == pytest.approx(0.9)
+    assert outcomes[24, 24].decision.agreement.support == pytest.approx(0.9 * 9)
+    assert outcomes[25, 25].decision.probability < outcomes[24, 24].decision.probability
 
 
 @pytest.mark.parametrize(("off", "agrees"), [(0.3, True), (3.0, False)])
@@ -170,7 +170,7 @@ def test_a_turned_neighbour_does_not_agree() -> None:
 def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promoted() -> None:
     rows = [alignment(k, 0.995) for k in range(20, 31) if k != 25] + [
         alignment(25, 0.9),
-        alignment(25, 0.95, at=50),
+        alignment(25, 0.95, target_keyframe=50),
     ]
     first, second = (
         o for o in decide(rows, MAPS, SETTINGS, model=MODEL) if o.alignment.query_keyframe == 25
@@ -186,15 +186,15 @@ def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promot
 
 
 def test_two_places_that_fit_alike_leave_each_other_no_certainty() -> None:
-    found = decided([alignment(25, 0.9999), alignment(25, 0.9999, at=50)])
-    for at in (25, 50):  # odds of 9999, twice, and 1
-        assert found[25, at].decision.probability == pytest.approx(9999 / 19999)
+    outcomes = decided([alignment(25, 0.9999), alignment(25, 0.9999, target_keyframe=50)])
+    for target_keyframe in (25, 50):  # odds of 9999, twice, and 1
+        assert outcomes[25, target_keyframe].decision.probability == pytest.approx(9999 / 19999)
         assert "other places fit too: by itself this one has a probability of 0.50" in sentence(
-            found[25, at]
+            outcomes[25, target_keyframe]
         )
-    found = decided([alignment(25, 0.9999), alignment(25, 0.6, at=50)])
-    assert accepted(found[25, 25])
-    assert not accepted(found[25, 50])
+    outcomes = decided([alignment(25, 0.9999), alignment(25, 0.6, target_keyframe=50)])
+    assert accepted(outcomes[25, 25])
+    assert not accepted(outcomes[25, 50])
 
 
 def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None:
@@ -210,9 +210,9 @@ def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None
         target_keyframe=60 + 25,
         target_T_query=yaw_transform(0.0, (3.0, 0.0, 0.0)),
     )
-    found = decided([alignment(25, 0.999), again], maps)
-    assert accepted(found[25, 25])
-    assert sentence(found[25, 85]) == "another place of the same session fits better"
+    outcomes = decided([alignment(25, 0.999), again], maps)
+    assert accepted(outcomes[25, 25])
+    assert sentence(outcomes[25, 85]) == "another place of the same session fits better"
 
 
 def shares(rows: list[Alignment], maps: dict[str, SessionMap] = MAPS) -> F64:
@@ -301,7 +301,7 @@ def test_sessions_that_do_not_meet_a_pair_change_nothing_of_it(seed: int, others
     maps = MAPS | {name: session(ROAD) for name in names}
     more = [
         dataclasses.replace(
-            alignment(k, float(rng.uniform(1e-6, 1e-3)), at=int(rng.integers(60))),
+            alignment(k, float(rng.uniform(1e-6, 1e-3)), target_keyframe=int(rng.integers(60))),
             target_session=name,
         )
         for name in names
@@ -313,8 +313,8 @@ def test_sessions_that_do_not_meet_a_pair_change_nothing_of_it(seed: int, others
         for k in range(50)
     ]
 
-    def of_pair(found: Sequence[Outcome]) -> list[tuple[int, Any, bool]]:
-        pair = [o for o in found if o.alignment.target_session == "b"]
+    def of_pair(outcomes: Sequence[Outcome]) -> list[tuple[int, Any, bool]]:
+        pair = [o for o in outcomes if o.alignment.target_session == "b"]
         return [(o.alignment.query_keyframe, o.decision, accepted(o)) for o in pair]
 
     queries = {"a": range(10, 40)}
@@ -330,12 +330,12 @@ STREETS = {"a": session(STRAIGHT), "b": session(STRAIGHT), "c": session(STRAIGHT
 COPIED = range(20, 40)
 
 
-def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment:
+def in_street(k: int, target_keyframe: int, query: str = "a", target: str = "b") -> Alignment:
     here = {
         "query_session": query,
         "target_session": target,
-        "target_keyframe": at,
-        "target_stamp_ns": at,
+        "target_keyframe": target_keyframe,
+        "target_stamp_ns": target_keyframe,
         "target_T_query": np.eye(4),
     }
     return dataclasses.replace(alignment(k, 0.999), **here)  # type: ignore[arg-type]
@@ -365,7 +365,7 @@ def test_how_far_off_its_own_odometry_a_session_may_be(
     off: float, way: float, refuted: bool
 ) -> None:
     def placed(query: str, target: str, posed: bool = True) -> Placed:
-        at = yaw_transform(0.0, (0.0, off, 0.0))[None]
+        target_T_query = yaw_transform(0.0, (0.0, off, 0.0))[None]
         half = np.full(1, 0.5)
         return Placed(
             np.array([query], object),
@@ -374,7 +374,7 @@ def test_how_far_off_its_own_odometry_a_session_may_be(
             np.array([150.0]),
             np.array([150.0 + way]),
             np.eye(4)[None],
-            at,
+            target_T_query,
             half,
             half,
             np.array([posed]),
@@ -389,7 +389,7 @@ def test_roads_of_queries_are_counted_once_whatever_answers() -> None:
     rows = [
         alignment(30, 0.5),
         alignment(20, 0.5),
-        alignment(20, 0.5, at=50),
+        alignment(20, 0.5, target_keyframe=50),
         alignment(40, 0.5, query="b", target="a"),
     ]
     roads = query_roads(place(rows, MAPS, MODEL))
@@ -429,21 +429,23 @@ def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_els
     ]
     there = [in_street(k, k, "c", "a") for k in COPIED]
     back = [in_street(k, k, "b", "c") for k in COPIED]
-    found = decide(once + twice + there + back, STREETS, SETTINGS, model=MODEL)
-    assert all(a.decision.agreement.ambiguity > 0.9 for a in found)
-    assert not any(accepted(a) for a in found)
-    assert sum("ambiguous place" in sentence(a) for a in found) == len(found) - len(COPIED)
+    outcomes = decide(once + twice + there + back, STREETS, SETTINGS, model=MODEL)
+    assert all(a.decision.agreement.ambiguity > 0.9 for a in outcomes)
+    assert not any(accepted(a) for a in outcomes)
+    assert sum("ambiguous place" in sentence(a) for a in outcomes) == len(outcomes) - len(COPIED)
 
 
 def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> None:
     right = [in_street(k, k, target="c") for k in range(2, 60)]
-    twice = [in_street(k, at) for k in (30, 31) for at in (k - 25, k + 15)]
-    found = [
+    twice = [
+        in_street(k, target_keyframe) for k in (30, 31) for target_keyframe in (k - 25, k + 15)
+    ]
+    outcomes = [
         a
         for a in decide(right + twice, STREETS, SETTINGS, model=MODEL)
         if a.alignment.target_session == "c"
     ]
-    assert all(accepted(a) and a.decision.agreement.ambiguity < 0.05 for a in found)
+    assert all(accepted(a) and a.decision.agreement.ambiguity < 0.05 for a in outcomes)
 
 
 @pytest.mark.parametrize(("road", "alike"), [(0.0, True), (2000.0, False)])
@@ -455,9 +457,9 @@ def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
         map_T_base=np.tile(STRAIGHT, (2, 1, 1)),
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
     )
-    rows = [in_street(k, at) for k in COPIED for at in (k, 100 + k + 12)]
-    found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, model=MODEL)
-    assert all((a.decision.agreement.ambiguity > 0.9) == alike for a in found)
+    rows = [in_street(k, target_keyframe) for k in COPIED for target_keyframe in (k, 100 + k + 12)]
+    outcomes = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, model=MODEL)
+    assert all((a.decision.agreement.ambiguity > 0.9) == alike for a in outcomes)
 
 
 def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
@@ -482,9 +484,9 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
 def test_three_single_sweeps_that_contradict_each_other(weakest: float, copies: bool) -> None:
     """Of sweeps a in b and c, and b in c, the least probable one is 40 m off."""
 
-    def sweep(query: str, target: str, at: int, alone: float) -> Alignment:
+    def sweep(query: str, target: str, target_keyframe: int, alone: float) -> Alignment:
         features = dataclasses.replace(GOOD, stiffness=float(np.log(alone / (1 - alone))))
-        return dataclasses.replace(in_street(30, at, query, target), features=features)
+        return dataclasses.replace(in_street(30, target_keyframe, query, target), features=features)
 
     a_in_b = sweep("a", "b", 30, 0.999)
     b_in_c = sweep("b", "c", 30, 0.999)
@@ -503,9 +505,11 @@ def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
         assert not accepted(a)
 
 
-@pytest.mark.parametrize("at", [lambda k: (7 * k) % 100, lambda k: k + 9])
-def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(at: Any) -> None:
-    rows = [in_street(k, where) for k in COPIED for where in (k, at(k))]
+@pytest.mark.parametrize("second_place", [lambda k: (7 * k) % 100, lambda k: k + 9])
+def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(
+    second_place: Any,
+) -> None:
+    rows = [in_street(k, where) for k in COPIED for where in (k, second_place(k))]
     assert all(
         a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS, model=MODEL)
     )
@@ -540,18 +544,18 @@ def test_without_odometry_nobody_is_a_neighbour() -> None:
 def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = [
-        alignment(k, float(rng.uniform(0.01, 1)), at=int(rng.integers(60)))
+        alignment(k, float(rng.uniform(0.01, 1)), target_keyframe=int(rng.integers(60)))
         for k in range(40)
         for _ in range(2)
     ]
     rows += [
-        dataclasses.replace(in_street(k, at), query_session="c")
+        dataclasses.replace(in_street(k, target_keyframe), query_session="c")
         for k in COPIED
-        for at in (k, k + 30)
+        for target_keyframe in (k, k + 30)
     ]
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
 
-    def keys(found: Sequence[Outcome]) -> list[Any]:
+    def keys(outcomes: Sequence[Outcome]) -> list[Any]:
         return [
             (
                 o.alignment.query_keyframe,
@@ -559,7 +563,7 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
                 o.decision,
                 accepted(o) or sentence(o),
             )
-            for o in found
+            for o in outcomes
         ]
 
     maps = {**STREETS, **MAPS, "b": STREETS["b"]}
@@ -603,7 +607,7 @@ def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) ->
         along = along[there]
         agrees = slow_agrees(group.part(np.array([k])), others_there, along, voxel_size)
         _, first, number = np.unique(others_there.query, return_index=True, return_inverse=True)
-        near = along[first] <= NEAR * scale
+        is_near = along[first] <= NEAR * scale
         for sums, p in zip(out, votes, strict=True):
             support = np.zeros(len(first))
             conflict = np.zeros(len(first))
@@ -611,10 +615,10 @@ def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) ->
             np.maximum.at(conflict, number, np.where(agrees, 0.0, p[there]))
             conflict[conflict <= support] = 0.0
             sums[:, k] = [
-                support[near].sum(),
-                conflict[near].sum(),
-                support[~near].sum(),
-                conflict[~near].sum(),
+                support[is_near].sum(),
+                conflict[is_near].sum(),
+                support[~is_near].sum(),
+                conflict[~is_near].sum(),
             ]
     return out
 
@@ -668,9 +672,9 @@ def test_voters_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
     )
     own = place_odds(placed, pairs_of(placed), placed.log_odds, voxel_size).share
     probabilities = own, placed.probability_ignoring_rivals
-    for found, expected in zip(
+    for sums, expected in zip(
         _sums(placed, probabilities, voxel_size),
         slow_sums(placed, probabilities, voxel_size),
         strict=True,
     ):
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(sums, expected, atol=1e-12)
