@@ -74,9 +74,9 @@ def engine(request: pytest.FixtureRequest, tasks: ModuleType) -> Iterator[Engine
 
 
 def test_results_come_in_the_order_of_the_tasks(engine: Engine, tasks: ModuleType) -> None:
-    found = list(engine.map(tasks.slow_square, (n for n in range(13))))
-    assert [value for value, _ in found] == [n * n for n in range(13)]
-    elsewhere = {pid for _, pid in found} != {os.getpid()}
+    results = list(engine.map(tasks.slow_square, (n for n in range(13))))
+    assert [value for value, _ in results] == [n * n for n in range(13)]
+    elsewhere = {pid for _, pid in results} != {os.getpid()}
     assert elsewhere == (engine.jobs > 1)
     assert list(engine.map(tasks.slow_square, [])) == []
     # the engine can be used again

@@ -106,16 +106,16 @@ def test_a_worker_that_cannot_be_interrupted_is_ended(
 
 
 def test_only_the_main_thread_has_a_limit(tasks: ModuleType) -> None:
-    found: list[int] = []
+    nbytes: list[int] = []
 
     def work() -> None:
         with memory_limit(1):
-            found.append(tasks.hungry(2))
+            nbytes.append(tasks.hungry(2))
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert found == [100_000_000]
+    assert nbytes == [100_000_000]
 
 
 _FREED = """

@@ -63,8 +63,8 @@ def plan(make_store: Make) -> tuple[ViewStore, Scenario]:
 
 def test_errors_are_metres_and_degrees() -> None:
     truth = yaw_transform(np.radians(30), (1.0, 2.0, 0.0))
-    found = yaw_transform(np.radians(45), (4.0, 6.0, 0.0))
-    assert pose_errors(truth, found) == pytest.approx((5.0, 15.0))
+    estimate = yaw_transform(np.radians(45), (4.0, 6.0, 0.0))
+    assert pose_errors(truth, estimate) == pytest.approx((5.0, 15.0))
 
 
 def test_answers_come_back_with_their_errors(
@@ -72,12 +72,12 @@ def test_answers_come_back_with_their_errors(
 ) -> None:
     store, scenario = plan
     assert answer_scenario(RUN, scenario, Learner(store, Nearest), tmp_path) == 100
-    found = read_answers(RUN, scenario, tmp_path)
-    assert len(found) == 100
-    assert found.first_m.tolist() == pytest.approx([0.25] * 100)
-    assert np.isfinite(found.errors_m).sum(axis=1).tolist() == [3] * 100
-    assert found.first_score.tolist() == pytest.approx([-0.25] * 100)
-    assert sorted(set(found.passage.tolist())) == [0, 1, 2, 3, 4]
+    answers = read_answers(RUN, scenario, tmp_path)
+    assert len(answers) == 100
+    assert answers.first_m.tolist() == pytest.approx([0.25] * 100)
+    assert np.isfinite(answers.errors_m).sum(axis=1).tolist() == [3] * 100
+    assert answers.first_score.tolist() == pytest.approx([-0.25] * 100)
+    assert sorted(set(answers.passage.tolist())) == [0, 1, 2, 3, 4]
     tables = [read_table(path) for path in tmp_path.glob("system=*/*/*.parquet")]
     assert tables
     assert all(table.schema.equals(contracts.schema("answers")) for table in tables)
@@ -134,10 +134,10 @@ def test_a_query_without_a_pose_is_an_answer(
             return []
 
     answer_scenario(RUN, scenario, Learner(store, Silent), tmp_path)
-    found = read_answers(RUN, scenario, tmp_path)
-    assert len(found) == 100
-    assert np.isinf(found.errors_m).all()
-    assert (found.first_score == -np.inf).all()
+    answers = read_answers(RUN, scenario, tmp_path)
+    assert len(answers) == 100
+    assert np.isinf(answers.errors_m).all()
+    assert (answers.first_score == -np.inf).all()
     assert answer_scenario(RUN, scenario, Learner(store, Silent), tmp_path) == 0
 
 

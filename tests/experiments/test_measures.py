@@ -29,14 +29,14 @@ NEVER = np.inf
 @pytest.mark.parametrize(("successes", "n"), [(0, 10), (3, 10), (10, 10), (57, 100)])
 def test_wilsons_bounds_are_scipys(successes: int, n: int) -> None:
     expected = binomtest(successes, n).proportion_ci(0.95, "wilson")
-    found = wilson(successes, n)
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
+    bounds = wilson(successes, n)
+    assert (bounds.low, bounds.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
 
 
 def test_nothing_is_known_without_samples() -> None:
-    found = wilson(0, 0)
-    assert math.isnan(found.value)
-    assert (found.low, found.high, found.n) == (0.0, 1.0, 0)
+    bounds = wilson(0, 0)
+    assert math.isnan(bounds.value)
+    assert (bounds.low, bounds.high, bounds.n) == (0.0, 1.0, 0)
 
 
 def test_a_query_counts_from_the_rank_of_its_first_near_pose_on() -> None:
@@ -82,8 +82,8 @@ def test_queries_of_one_passage_tell_no_more_than_one_query() -> None:
 
 
 def test_where_all_queries_are_alike_the_passages_are_the_samples() -> None:
-    found = ratio(np.ones(40, bool), np.repeat(np.arange(10), 4))
-    assert found == wilson(10, 10)
+    share = ratio(np.ones(40, bool), np.repeat(np.arange(10), 4))
+    assert share == wilson(10, 10)
 
 
 def test_a_difference_on_the_same_queries_is_surer_than_on_others() -> None:
@@ -128,12 +128,12 @@ def test_abstaining_is_judged_by_the_threshold_of_the_other_half() -> None:
     passage = np.arange(40)
     right = np.arange(40) % 4 < 2
     score = np.where(right, 2.0, 1.0)
-    found = abstaining(score, right, passage, allowed=0.0)
-    assert found.false_discovery.value == 0.0
-    assert found.coverage.value == 0.5
+    figures = abstaining(score, right, passage, allowed=0.0)
+    assert figures.false_discovery.value == 0.0
+    assert figures.coverage.value == 0.5
     # a half in which wrong ones score highest admits nothing to the other half
     odd = passage % 2 == 1
     score = np.where(odd & ~right, 3.0, score)
-    found = abstaining(score, right, passage, allowed=0.0)
-    assert found.coverage.value == pytest.approx(0.5)
-    assert found.false_discovery.value == pytest.approx(0.5)
+    figures = abstaining(score, right, passage, allowed=0.0)
+    assert figures.coverage.value == pytest.approx(0.5)
+    assert figures.false_discovery.value == pytest.approx(0.5)

@@ -39,12 +39,12 @@ def answers(share: float, rank: int = 1) -> Answers:
 
 
 def finding(known: dict[tuple[str, str, str], Answers], text: str, scenario: str) -> Finding:
-    (found,) = [
+    (only,) = [
         f
         for f in findings(known, [SIFT, FPFH])
         if f.hypothesis == text and f.scenario == scenario and f.method in (PAPER.title, "SIFT")
     ]
-    return found
+    return only
 
 
 @pytest.mark.parametrize(
@@ -62,10 +62,10 @@ def test_an_order_holds_where_its_bounds_exclude_the_other_one(
         (SEMANTIC, "lidar", "90"): answers(semantic),
         (GEOMETRIC, "lidar", "90"): answers(geometric),
     }
-    found = finding(known, "semantic above geometric", "90")
-    assert found.verdict == verdict
-    assert found.figure is not None
-    assert found.figure.value == pytest.approx(semantic - geometric)
+    order = finding(known, "semantic above geometric", "90")
+    assert order.verdict == verdict
+    assert order.figure is not None
+    assert order.figure.value == pytest.approx(semantic - geometric)
     assert finding(known, "geometric above FPFH", "90").verdict == Verdict.UNKNOWN
 
 
@@ -110,11 +110,11 @@ def test_ours_falls_least_from_one_time_to_another() -> None:
         known[system, "lidar", "summer>summer"] = answers(same)
         known[system, "lidar", "summer>snow"] = answers(other)
     text = "from one time to another it falls least"
-    found = finding(known, text, "cross-time")
-    assert found.verdict == Verdict.HOLDS
-    assert found.figure is not None
+    order = finding(known, text, "cross-time")
+    assert order.verdict == Verdict.HOLDS
+    assert order.figure is not None
     # FPFH falls by 0.4, ours by 0.05
-    assert found.figure.value == pytest.approx(0.35)
+    assert order.figure.value == pytest.approx(0.35)
 
 
 def test_our_pipeline_is_tested_in_its_own_right() -> None:

@@ -156,12 +156,12 @@ def test_ours_finds_both_queries_to_centimetres(
     system.fit(database)
     assert {p.name for p in (tmp_path / "sessions").iterdir()} == {"west", "east"}
     for query in queries:
-        found = system.localise(hidden(query))
-        metres, degrees = errors(found[0], query)
+        poses = system.localise(hidden(query))
+        metres, degrees = errors(poses[0], query)
         assert metres < 0.25
         assert degrees < 1.0
-        assert len(found) > 3
-        scores = [pose.score for pose in found]
+        assert len(poses) > 3
+        scores = [pose.score for pose in poses]
         assert scores == sorted(scores, reverse=True)
 
 
@@ -206,12 +206,12 @@ def test_the_plain_method_finds_a_cloud_again_that_was_turned(
     system.fit(places)
     turned = yaw_transform(np.pi, (50.3, 7.1, -2.0))
     query = Query("again", (replace(places[2], odom_T_base=turned),))
-    found = system.localise(hidden(query))
-    assert len(found) == 10
-    metres, degrees = errors(found[0], query)
+    poses = system.localise(hidden(query))
+    assert len(poses) == 10
+    metres, degrees = errors(poses[0], query)
     assert metres < 0.2
     assert degrees < 1.0
-    scores = [pose.score for pose in found]
+    scores = [pose.score for pose in poses]
     assert scores == sorted(scores, reverse=True)
     assert scores[-1] >= 0.3
     assert scores[0] <= 1.0
@@ -296,8 +296,8 @@ def test_every_ablation_finds_the_view_of_the_opposite_lane(
     assert system.name == name
     system.fit(database)
     query = queries[0]
-    found = system.localise(hidden(query))
-    metres, degrees = errors(found[0], query)
+    poses = system.localise(hidden(query))
+    metres, degrees = errors(poses[0], query)
     # a pose that was not refined is as good as the steps of the search
     assert metres < (1.0 if name == "ours-not-refined" else 0.25)
     assert degrees < (5.0 if name == "ours-not-refined" else 1.0)

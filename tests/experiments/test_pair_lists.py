@@ -52,10 +52,10 @@ def test_a_pair_is_a_query_in_a_database_of_one_view(make_store: Callable[..., V
     # views 0 to 9 of either session are at 1 s to 10 s, frames 5 to 50
     scenario = pair_scenario(store, [pair(10, 30), pair(6, 44), pair(5, 5, 7)], frames)
     assert scenario.name == "pairs"
-    found = [(t.queries[0].view, t.database.tolist()) for t in scenario.trials]
+    trials = [(t.queries[0].view, t.database.tolist()) for t in scenario.trials]
     # 6 is 0.2 s after the first view, 44 is 0.2 s before the ninth
     # a view is not paired with itself
-    assert found == [(11, [15]), (10, [18])]
+    assert trials == [(11, [15]), (10, [18])]
     assert scenario.trials[0].queries[0].name == "kitti_08@2000000000 on kitti_08@6000000000"
     assert [t.queries[0].passage for t in scenario.trials] == [0, 1]
 

@@ -196,10 +196,10 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
         {"role": "camera_info", "topic": "/front/camera_info"},
         {"role": "imu", "topic": "/imu"},
     ]
-    found: dict[str, Any] = {"streams": streams, "logs": [{"encoding": "ros2"}]}
+    changes: dict[str, Any] = {"streams": streams, "logs": [{"encoding": "ros2"}]}
     for name, frame in (("a", "odom"), ("b", "")):
         path = work.session(name).session_json
-        write_json(path, json.loads(path.read_text()) | found | {"session_frame": frame})
+        write_json(path, json.loads(path.read_text()) | changes | {"session_frame": frame})
     _close(work)
     (with_target,) = export(work, ["b"], "foxglove-layout", tmp_path)
     scene = json.loads(with_target.read_text())["configById"]["3D!closures"]

@@ -181,8 +181,8 @@ def test_clouds_come_back(form: str, frame: Any, tmp_path: Path) -> None:
     centres, label = make(Workspace(tmp_path), NEAR)
     (path,) = export(Workspace(tmp_path), [], form, tmp_path / "out", Selection(frame=frame))
     assert path.name == f"town.{form}"
-    xyz, found, rgb = READERS[form](path)
-    assert found.ravel().tolist() == label.tolist()
+    xyz, label_read, rgb = READERS[form](path)
+    assert label_read.ravel().tolist() == label.tolist()
     np.testing.assert_allclose(
         xyz,
         apply(NEAR, centres) if frame == "session" else centres,
@@ -204,9 +204,9 @@ def test_only_what_lies_in_the_bounds(form: str, tmp_path: Path) -> None:
         (placed[:, 0] >= 40) & (placed[:, 0] < 90) & (placed[:, 1] >= -10) & (placed[:, 1] < 60)
     )
     assert 20 < inside.sum() < 400
-    xyz, found, _ = READERS[form](path)
+    xyz, label_read, _ = READERS[form](path)
     np.testing.assert_allclose(xyz, placed[inside], atol=6e-4)
-    assert found.ravel().tolist() == label[inside].tolist()
+    assert label_read.ravel().tolist() == label[inside].tolist()
 
 
 def test_bounds_skip_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -356,5 +356,5 @@ def test_the_command_exports_and_refuses_what_makes_no_sense(tmp_path: Path) -> 
         ("xyz", "--bounds", "1", "0", "1", "5"),
         ("xyz", "--bounds", "nan", "0", "1", "5"),
     ):
-        code, said = run("--format", *wrong)
-        assert code == 2, said
+        code, output = run("--format", *wrong)
+        assert code == 2, output

@@ -53,8 +53,8 @@ def web() -> Iterator[WebServer]:
 
 @pytest.fixture
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bucket]:
-    with s3_server(monkeypatch) as found:
-        yield found
+    with s3_server(monkeypatch) as opened_bucket:
+        yield opened_bucket
 
 
 @pytest.fixture(autouse=True)
@@ -357,9 +357,9 @@ def test_copies_and_sidecars_go_back_to_the_server(
     annotate_copy(log, tmp_path / "local.mcap", RESULTS)
     assert bucket.get("out/copy.mcap") == (tmp_path / "local.mcap").read_bytes()
     own = {"/semloc/loop_closures", "/semloc/pose", "/semloc/pose/b", "/semloc/markers"}
-    found = topics(bucket.get("out/sidecar.mcap"), tmp_path)
-    assert found
-    assert found <= own | {"/tf", "/semloc/map"}
+    written = topics(bucket.get("out/sidecar.mcap"), tmp_path)
+    assert written
+    assert written <= own | {"/tf", "/semloc/map"}
     assert "/text" in topics(bucket.get("out/copy.mcap"), tmp_path)
     with pytest.raises(LogError, match="exists already"):
         annotate_copy(source, copy, RESULTS)

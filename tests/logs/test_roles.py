@@ -36,9 +36,9 @@ def test_sensors_of_another_robot_are_left_out_once_the_poses_are_chosen() -> No
     topics = {f"/robot{k}/points": CLOUD for k in (1, 2)}
     topics |= {f"/robot{k}/odom": ODOM for k in (1, 2)}
     topics |= {f"/robot{k}/imu": IMU for k in (1, 2)}
-    found = roles(topics, pose="/robot2/odom")
-    assert (found.lidar, found.imu) == (("/robot2/points",), "/robot2/imu")
-    assert any("/robot1/points: left out" in note for note in sentences(found.notes))
+    chosen = roles(topics, pose="/robot2/odom")
+    assert (chosen.lidar, chosen.imu) == (("/robot2/points",), "/robot2/imu")
+    assert any("/robot1/points: left out" in note for note in sentences(chosen.notes))
     both = roles(topics, pose="/robot2/odom", lidar="/robot1/points,/robot2/points")
     assert len(both.lidar) == 2
 
@@ -51,7 +51,7 @@ def test_sensors_with_namespaces_of_their_own_are_of_one_car() -> None:
 
 
 def test_a_car_with_everything() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/lidar_top/points": CLOUD,
             "/lidar_rear/points": CLOUD,
@@ -69,17 +69,17 @@ def test_a_car_with_everything() -> None:
             "/rosout": "rosgraph_msgs/msg/Log",
         }
     )
-    assert found.lidar == ("/lidar_rear/points", "/lidar_top/points")
-    assert (found.pose, found.imu, found.gnss) == ("/odometry", "/imu/data", "/fix")
-    assert (found.tf, found.tf_static) == (("/tf",), ("/tf_static",))
-    assert found.info_of["/cam_back/image_raw/compressed"] == "/cam_back/camera_info"
-    assert found.role_of("/rosout") is None
-    assert found.role_of("/map") is None
-    assert any("--topic lidar=/map" in note for note in sentences(found.notes))
+    assert chosen.lidar == ("/lidar_rear/points", "/lidar_top/points")
+    assert (chosen.pose, chosen.imu, chosen.gnss) == ("/odometry", "/imu/data", "/fix")
+    assert (chosen.tf, chosen.tf_static) == (("/tf",), ("/tf_static",))
+    assert chosen.info_of["/cam_back/image_raw/compressed"] == "/cam_back/camera_info"
+    assert chosen.role_of("/rosout") is None
+    assert chosen.role_of("/map") is None
+    assert any("--topic lidar=/map" in note for note in sentences(chosen.notes))
 
 
 def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/camera/pose": POSE,
             "/camera/color/image/compressed": JPEG,
@@ -89,16 +89,16 @@ def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
             "/camera/depth/points": CLOUD,
         }
     )
-    assert found.depth == ("/camera/depth/image/compressedDepth",)
-    assert found.image == ("/camera/color/image/compressed",)
-    assert found.info_of[found.depth[0]] == "/camera/depth/camera_info"
-    assert found.info_of[found.image[0]] == "/camera/color/camera_info"
-    assert found.pose == "/camera/pose"
-    assert found.lidar == ()  # the depth image once more
+    assert chosen.depth == ("/camera/depth/image/compressedDepth",)
+    assert chosen.image == ("/camera/color/image/compressed",)
+    assert chosen.info_of[chosen.depth[0]] == "/camera/depth/camera_info"
+    assert chosen.info_of[chosen.image[0]] == "/camera/color/camera_info"
+    assert chosen.pose == "/camera/pose"
+    assert chosen.lidar == ()  # the depth image once more
 
 
 def test_the_same_picture_through_two_transports_counts_once() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/d/depth": IMAGE,
             "/d/depth/compressedDepth": JPEG,
@@ -106,8 +106,8 @@ def test_the_same_picture_through_two_transports_counts_once() -> None:
             "/d/rgb/image_raw/compressed": JPEG,
         }
     )
-    assert found.depth == ("/d/depth",)
-    assert found.image == ("/d/rgb/image_raw",)
+    assert chosen.depth == ("/d/depth",)
+    assert chosen.image == ("/d/rgb/image_raw",)
 
 
 @pytest.mark.parametrize(
@@ -121,25 +121,25 @@ def test_one_depth_stream_for_each_camera(labelled: bool, expected: str) -> None
     }
     if labelled:
         topics["/camera/color/labels"] = IMAGE
-    found = roles(topics)
-    assert found.depth == (expected,)
-    assert found.label_image == (("/camera/color/labels",) if labelled else ())
+    chosen = roles(topics)
+    assert chosen.depth == (expected,)
+    assert chosen.label_image == (("/camera/color/labels",) if labelled else ())
 
 
 def test_label_images_but_not_their_coloured_version() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/unet/raw_segmentation_mask": IMAGE,
             "/unet/colored_segmentation_mask": IMAGE,
             "/depth/image": IMAGE,
         }
     )
-    assert found.label_image == ("/unet/raw_segmentation_mask",)
-    assert found.label_of == {"/depth/image": "/unet/raw_segmentation_mask"}
+    assert chosen.label_image == ("/unet/raw_segmentation_mask",)
+    assert chosen.label_of == {"/depth/image": "/unet/raw_segmentation_mask"}
 
 
 def test_stereo_pairs() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/cam0/image_raw": IMAGE,
             "/cam1/image_raw": IMAGE,
@@ -147,19 +147,19 @@ def test_stereo_pairs() -> None:
             "/cam1/camera_info": INFO,
         }
     )
-    assert (found.stereo_left, found.stereo_right) == ("/cam0/image_raw", "/cam1/image_raw")
-    assert found.info_of["/cam1/image_raw"] == "/cam1/camera_info"
-    assert found.role_of("/cam0/image_raw") == "stereo_left"
+    assert (chosen.stereo_left, chosen.stereo_right) == ("/cam0/image_raw", "/cam1/image_raw")
+    assert chosen.info_of["/cam1/image_raw"] == "/cam1/camera_info"
+    assert chosen.role_of("/cam0/image_raw") == "stereo_left"
     assert roles({"/left/image": IMAGE, "/other/image": IMAGE}).stereo_left is None
 
 
 def test_a_stereo_pair_beside_ranges_stays_two_images_unless_it_is_named() -> None:
     pair = {"/left/image_raw": IMAGE, "/right/image_raw": IMAGE}
     for ranges in ({"/points": CLOUD}, {"/depth/image": IMAGE}):
-        found = roles(pair | ranges)
-        assert (found.stereo_left, found.stereo_right) == (None, None)
-        assert found.image == ("/left/image_raw", "/right/image_raw")
-        assert found.ranging == tuple(ranges)
+        chosen = roles(pair | ranges)
+        assert (chosen.stereo_left, chosen.stereo_right) == (None, None)
+        assert chosen.image == ("/left/image_raw", "/right/image_raw")
+        assert chosen.ranging == tuple(ranges)
         for named in ({"stereo_left": "/left/image_raw"}, {"stereo_right": "/right/image_raw"}):
             named_pair = roles(pair | ranges, **named)
             assert (named_pair.stereo_left, named_pair.stereo_right) == (
@@ -174,8 +174,8 @@ def test_a_pair_takes_two_topics() -> None:
     for named in ({"stereo_left": "/a"}, {"stereo_left": "/a", "stereo_right": "/a"}):
         with pytest.raises(RoleError, match="A stereo pair takes two topics"):
             roles({"/a": IMAGE, "/b": IMAGE}, **named)
-    found = roles({"/a": IMAGE, "/b": IMAGE}, stereo_left="/b", stereo_right="/a")
-    assert found.ranging == ("/b",)
+    chosen = roles({"/a": IMAGE, "/b": IMAGE}, stereo_left="/b", stereo_right="/a")
+    assert chosen.ranging == ("/b",)
 
 
 @pytest.mark.parametrize(
@@ -276,11 +276,11 @@ def test_an_override_takes_the_topic_from_its_guessed_role() -> None:
         "/a": CLOUD,
         "/b": CLOUD,
     }
-    found = roles(topics, label_image="/x", lidar="/b,/a")
-    assert found.label_image == ("/x",)
-    assert found.image == ()
-    assert found.lidar == ("/b", "/a")
-    assert found.label_of == {"/front/depth": "/x"}
+    chosen = roles(topics, label_image="/x", lidar="/b,/a")
+    assert chosen.label_image == ("/x",)
+    assert chosen.image == ()
+    assert chosen.lidar == ("/b", "/a")
+    assert chosen.label_of == {"/front/depth": "/x"}
 
 
 def test_streams_without_messages_play_no_role() -> None:
@@ -291,7 +291,7 @@ def test_streams_without_messages_play_no_role() -> None:
 
 
 def test_foxglove_types() -> None:
-    found = roles(
+    chosen = roles(
         {
             "/lidar": "foxglove.PointCloud",
             "/cam": "foxglove.CompressedImage",
@@ -300,14 +300,14 @@ def test_foxglove_types() -> None:
             "/gps": "foxglove.LocationFix",
         }
     )
-    assert found.to_json() == {
+    assert chosen.to_json() == {
         "lidar": ["/lidar"],
         "image": ["/cam"],
         "camera_info": ["/cam_calibration"],
         "tf": ["/tf"],
         "gnss": ["/gps"],
     }
-    assert found.info_of == {"/cam": "/cam_calibration"}
+    assert chosen.info_of == {"/cam": "/cam_calibration"}
 
 
 def test_a_log_without_range_sensor_is_told_what_it_has() -> None:

@@ -36,10 +36,10 @@ def test_turning_is_what_the_slow_loop_says(
     turn(state, low, yaw, np.array(centre), out)
     R = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     for ijk in np.ndindex(*size):
-        at = np.array(centre) + R @ (np.array(ijk) + 0.5 - np.array(size) / 2)
-        if np.abs(at - np.round(at)).min() < 1e-6:  # on a border rounding decides
+        position = np.array(centre) + R @ (np.array(ijk) + 0.5 - np.array(size) / 2)
+        if np.abs(position - np.round(position)).min() < 1e-6:  # on a border rounding decides
             continue
-        cell = np.floor(at).astype(int) - low
+        cell = np.floor(position).astype(int) - low
         inside = (cell >= 0).all() and (cell < state.shape).all()
         assert out[ijk] == (state[tuple(cell)] if inside else 253)
 

@@ -63,11 +63,11 @@ def full_precision() -> Iterator[None]:
         yield
 
 
-def one_by_one(state: U8, found: Described, encoder: Encoder) -> NDArray[np.float32]:
+def one_by_one(state: U8, described: Described, encoder: Encoder) -> NDArray[np.float32]:
     """Each described subvolume cut out of the map with its margin and encoded alone."""
     out = []
     padded = np.pad(state, ((64, 64), (64, 64), (64, 64)), constant_values=253)
-    for centre in found.centre:
+    for centre in described.centre:
         corner = (centre - SIZE / 2).astype(int) - LOW + 64
         x, y, z = corner - [MARGIN, MARGIN, 0]
         crop = padded[x : x + WIDE, y : y + WIDE, z : z + SIZE]
@@ -88,17 +88,19 @@ def test_a_map_at_once_is_its_subvolumes_one_by_one(
     state = world()
     encoder = random_encoder(variant)
     with full_precision():
-        found = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
-    assert len(found.descriptor) > 30
-    np.testing.assert_allclose(np.linalg.norm(found.descriptor, axis=1), 1, atol=1e-5)
-    some = np.arange(0, len(found.centre), len(found.centre) // 7)
-    single = one_by_one(state, Described(found.centre[some], found.descriptor[some]), encoder)
-    np.testing.assert_allclose(found.descriptor[some], single, atol=1e-5)
+        described = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
+    assert len(described.descriptor) > 30
+    np.testing.assert_allclose(np.linalg.norm(described.descriptor, axis=1), 1, atol=1e-5)
+    some = np.arange(0, len(described.centre), len(described.centre) // 7)
+    single = one_by_one(
+        state, Described(described.centre[some], described.descriptor[some]), encoder
+    )
+    np.testing.assert_allclose(described.descriptor[some], single, atol=1e-5)
     reduced = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
-    np.testing.assert_array_equal(reduced.centre, found.centre)
-    assert np.abs(reduced.descriptor - found.descriptor).max() < 1e-2
+    np.testing.assert_array_equal(reduced.centre, described.centre)
+    assert np.abs(reduced.descriptor - described.descriptor).max() < 1e-2
     # the step in the ground needs more than one layer
-    assert len(np.unique(found.centre[:, 2])) > 1
+    assert len(np.unique(described.centre[:, 2])) > 1
 
 
 def test_a_finer_stride_contains_the_coarser_one() -> None:
@@ -117,9 +119,11 @@ def test_a_finer_stride_contains_the_coarser_one() -> None:
 def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> None:
     state = world()
     padded = np.pad(state, 64, constant_values=253)
-    found = describe_map(state, LOW, (12 - 16) * V, random_encoder("geometric"), Windows(V, 8, 400))
+    described = describe_map(
+        state, LOW, (12 - 16) * V, random_encoder("geometric"), Windows(V, 8, 400)
+    )
     bottoms = []
-    for centre in found.centre:
+    for centre in described.centre:
         x, y, z = (centre - SIZE / 2).astype(int) - LOW + 64
         part = occupied(padded[x : x + SIZE, y : y + SIZE, z : z + SIZE])
         assert part.sum() >= 400
@@ -128,7 +132,7 @@ def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> No
     everywhere = describe_map(
         state, LOW, (12 - 16) * V, random_encoder("geometric"), Windows(V, 8, 1)
     )
-    assert len(everywhere.centre) > len(found.centre)
+    assert len(everywhere.centre) > len(described.centre)
 
 
 def test_a_map_described_in_other_words_of_its_own_position() -> None:
@@ -171,11 +175,11 @@ def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
     ],
 )
 def test_maps_with_nothing_occupied(state: U8) -> None:
-    found = describe_map(
+    described = describe_map(
         state, np.zeros(3, int), 0.0, random_encoder("geometric"), Windows(V, 8, 1)
     )
-    assert found.centre.shape == (0, 3)
-    assert found.descriptor.shape == (0, 256)
+    assert described.centre.shape == (0, 3)
+    assert described.descriptor.shape == (0, 256)
 
 
 def test_a_single_voxel_and_a_small_map() -> None:
@@ -190,11 +194,11 @@ def test_a_single_voxel_and_a_small_map() -> None:
         == 0
     )
     state[6:10, 6:10, 8:12] = 2
-    found = describe_map(
+    described = describe_map(
         state, np.zeros(3, int), 0.0, random_encoder("geometric"), Windows(V, 8, 20)
     )
-    assert len(found.centre) > 0
-    assert np.abs(found.centre[:, :2] - 8).max() <= SIZE
+    assert len(described.centre) > 0
+    assert np.abs(described.centre[:, :2] - 8).max() <= SIZE
 
 
 def test_other_strides_are_refused() -> None:
@@ -291,15 +295,15 @@ def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
     state = np.full((80, 96, 40), 254, np.uint8)
     state[60:64, 20:24, 12:16] = 2
     turned = turned_map(state, LOW, yaw)
-    found = describe_map(
+    described = describe_map(
         turned.state, turned.low, -4 * V, random_encoder("geometric"), Windows(V, 4, 40)
     )
-    away = turned.to_map(found.centre)[:, :2] - (LOW[:2] + np.array([62, 22]))
+    away = turned.to_map(described.centre)[:, :2] - (LOW[:2] + np.array([62, 22]))
     assert len(away) >= 5
     assert np.abs(away).max() < 16 * np.sqrt(2) + 2
     assert np.abs(away.mean(0)).max() < 2.5
     np.testing.assert_allclose(
-        turned.from_map(turned.to_map(found.centre)[:, :2]), found.centre[:, :2], atol=1e-4
+        turned.from_map(turned.to_map(described.centre)[:, :2]), described.centre[:, :2], atol=1e-4
     )
 
 
@@ -308,14 +312,14 @@ def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
     encoder = random_encoder("geometric", seed=2)
     state = world()
     turned = [turned_map(state, LOW, yaw) for yaw in (np.pi / 10, np.pi / 10 + np.pi / 2)]
-    found = [
+    described = [
         describe_map(t.state, t.low, (12 - 16) * V, encoder, Windows(V, 8, 40)) for t in turned
     ]
-    known, asked = (t.to_map(f.centre) for t, f in zip(turned, found, strict=True))
+    known, asked = (t.to_map(f.centre) for t, f in zip(turned, described, strict=True))
     i, j = np.nonzero(np.linalg.norm(known[:, None] - asked[None], axis=2) < 0.01)
     assert len(i) > 10
     np.testing.assert_allclose(
-        quarter_turns(found[1].descriptor[j], 1), found[0].descriptor[i], atol=0.05
+        quarter_turns(described[1].descriptor[j], 1), described[0].descriptor[i], atol=0.05
     )
 
 

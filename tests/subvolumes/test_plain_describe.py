@@ -55,12 +55,12 @@ def test_windows_hold_so_many_occupied_voxels() -> None:
 
 
 def test_every_subvolume_with_the_voxel_is_described(encoder: PlainEncoder) -> None:
-    found = describe_blocks(one_voxel_a_block(np.array([[0, 0, 0]])), 8, 1, encoder)
+    described = describe_blocks(one_voxel_a_block(np.array([[0, 0, 0]])), 8, 1, encoder)
     # the voxel at 3 lies in windows that begin at -24, -16, -8 and 0
-    assert len(found.centre) == 64
-    assert found.centre.min(0).tolist() == [-8, -8, -8]
-    assert found.centre.max(0).tolist() == [16, 16, 16]
-    assert found.descriptor.shape == (64, 256)
+    assert len(described.centre) == 64
+    assert described.centre.min(0).tolist() == [-8, -8, -8]
+    assert described.centre.max(0).tolist() == [16, 16, 16]
+    assert described.descriptor.shape == (64, 256)
 
 
 def test_tiles_change_nothing(encoder: PlainEncoder) -> None:
@@ -78,9 +78,9 @@ def test_tiles_change_nothing(encoder: PlainEncoder) -> None:
 def test_only_subvolumes_near_the_road_are_described(encoder: PlainEncoder) -> None:
     blocks = one_voxel_a_block(np.array([[0, 0, 0], [40, 0, 0]]))
     assert unpack(blocks.keys)[1].tolist() == [40, 0, 0]
-    near = describe_blocks(blocks, 8, 1, encoder, (np.array([[0.0, 0.0]]), 100.0))
-    assert len(near.centre) == 64
-    assert near.centre[:, 0].max() < 100
+    beside_road = describe_blocks(blocks, 8, 1, encoder, (np.array([[0.0, 0.0]]), 100.0))
+    assert len(beside_road.centre) == 64
+    assert beside_road.centre[:, 0].max() < 100
 
 
 def test_windows_of_a_box_are_described_as_each_alone(encoder: PlainEncoder) -> None:
@@ -92,9 +92,9 @@ def test_windows_of_a_box_are_described_as_each_alone(encoder: PlainEncoder) -> 
     state[:, 30] = 2
     state[:12, :12, :12] = rng.choice([0, 2, FREE_STATE, UNOBSERVED_STATE], (12, 12, 12))
     corners = np.array([[0, 0, 0], [2, 4, 8], [13, 18, 9], [12, 17, 0], [2, 18, 8]])
-    found = describe_windows(state, corners, encoder)
+    vectors = describe_windows(state, corners, encoder)
     size = slice(0, SIZE)
-    for corner, vector in zip(corners, found, strict=True):
+    for corner, vector in zip(corners, vectors, strict=True):
         x, y, z = corner
         alone = torch.from_numpy(code_table("geometric")[state[x:, y:, z:][size, size, size]])
         with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
@@ -137,5 +137,5 @@ def test_windows_are_counted_as_one_by_one(stride: int) -> None:
         if (state[x : x + SIZE, y : y + SIZE, z : z + SIZE] == 7).sum() >= 6
     ]
     assert 0 < len(expected) < len(range(0, 46, stride)) * len(range(0, 27, stride)) * 3
-    found = occupied_windows(state, np.array([32, 0, -32]), stride, 6)
-    np.testing.assert_array_equal(found - [32, 0, -32], expected)
+    corners = occupied_windows(state, np.array([32, 0, -32]), stride, 6)
+    np.testing.assert_array_equal(corners - [32, 0, -32], expected)

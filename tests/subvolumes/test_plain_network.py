@@ -43,8 +43,8 @@ def test_the_first_block_equals_convolution_relu_and_pooling(variant: str) -> No
     torch.testing.assert_close(quick, plain)
     wanted = torch.randn(plain.shape)
     expected = torch.autograd.grad((plain * wanted).sum(), [first.weight, first.bias])
-    found = torch.autograd.grad((quick * wanted).sum(), [first.weight, first.bias])
-    for a, b in zip(found, expected, strict=True):
+    gradients = torch.autograd.grad((quick * wanted).sum(), [first.weight, first.bias])
+    for a, b in zip(gradients, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
 
 
@@ -53,8 +53,8 @@ def test_the_last_block_equals_repetition_and_convolution() -> None:
     layer = torch.nn.Conv3d(3, 5, 3, padding=1)
     x = torch.randn(2, 3, 4, 4, 4)
     large = x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)
-    found = repeated_convolution(x, layer).reshape(2, 5, 8, 4, 4, 4)
-    volumes = as_volumes(found.permute(1, 2, 0, 3, 4, 5))
+    blocks = repeated_convolution(x, layer).reshape(2, 5, 8, 4, 4, 4)
+    volumes = as_volumes(blocks.permute(1, 2, 0, 3, 4, 5))
     torch.testing.assert_close(volumes, layer(large))
 
 

@@ -213,12 +213,12 @@ def states_of(name: str, folder: Path, lost_sync: int = -1) -> tuple[list[Tree],
     writer, before, _, _ = WRITERS[name]
     disk = LossyDisk(write_tree(before, folder))
     disk.lost_sync = lost_sync
-    found: list[Tree] = []
-    disk.visit = lambda: found.extend(s for s in disk.states() if s not in found)
+    states: list[Tree] = []
+    disk.visit = lambda: states.extend(s for s in disk.states() if s not in states)
     with disk.watching():
         writer(folder)
     last = list(disk.states())
-    return found + last, last, disk.syncs
+    return states + last, last, disk.syncs
 
 
 def torn(name: str, states: list[Tree]) -> list[Tree]:

@@ -30,10 +30,10 @@ def test_tables_come_back_with_their_metadata(rows: int, tmp_path: Path) -> None
     path = tmp_path / "words.parquet"
     table = contracts.table("words", columns(rows))
     write_table(path, table, {"b": [1, 2], "a": "ü"}, ("submap",))
-    found = read_table(path)
-    assert found.schema.equals(contracts.schema("words"))
-    assert found.num_rows == rows
-    assert found.to_pydict() == table.to_pydict()
+    read = read_table(path)
+    assert read.schema.equals(contracts.schema("words"))
+    assert read.num_rows == rows
+    assert read.to_pydict() == table.to_pydict()
     assert read_table(path, ["word", "x"]).column_names == ["word", "x"]
     assert read_metadata(path) == {"a": "ü", "b": [1, 2]}
     plain = tmp_path / "plain"

@@ -73,8 +73,8 @@ def reference(parts: list[Rows]) -> list[tuple[list[int], int, int, int]]:
     return sorted(out, key=lambda row: int(morton(np.array(row[0]))))
 
 
-def resolved(found: Evidence) -> list[tuple[list[int], int, int, int]]:
-    v = resolve(found, LOW, HIGH)
+def resolved(evidence_of_voxels: Evidence) -> list[tuple[list[int], int, int, int]]:
+    v = resolve(evidence_of_voxels, LOW, HIGH)
     return list(
         zip(v.ijk.tolist(), v.label.tolist(), v.log_odds.tolist(), v.hits.tolist(), strict=True)
     )
@@ -90,10 +90,10 @@ def same(a: Evidence, b: Evidence) -> bool:
 @given(st.lists(rows, min_size=1, max_size=5), st.randoms(use_true_random=False))
 @settings(max_examples=150, deadline=None)
 def test_merging_is_the_sum_in_any_order_and_grouping(parts: list[Rows], random: object) -> None:
-    found = [as_evidence(p) for p in parts]
-    left = reduce(merge, found)
+    evidences = [as_evidence(p) for p in parts]
+    left = reduce(merge, evidences)
     assert resolved(left) == reference(parts)
-    shuffled = found.copy()
+    shuffled = evidences.copy()
     random.shuffle(shuffled)  # type: ignore[attr-defined]
     while len(shuffled) > 1:  # neighbours first, then pairs of pairs
         shuffled = [reduce(merge, shuffled[i : i + 2]) for i in range(0, len(shuffled), 2)]
@@ -159,7 +159,9 @@ def test_tiles_go_to_disk_and_come_back_and_do_not_grow(tmp_path: Path) -> None:
     # classes are random here, so each round may add votes of a new one until all 19 have some
     assert sizes[-1] < 2.5 * sizes[1]
     for x in (0, -1, 4):
-        parts = [part for at, blocks in every if at == x for _, part in evidence(blocks, 256)]
+        parts = [
+            part for tile_x, blocks in every if tile_x == x for _, part in evidence(blocks, 256)
+        ]
         assert same(tiles.take((x, 0)), reduce(merge, parts))
     assert not list(tmp_path.iterdir())
 

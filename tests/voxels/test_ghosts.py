@@ -53,10 +53,10 @@ def sweep(car_y: float | None) -> tuple[F64, NDArray[np.uint8]]:
         reach = np.minimum(reach, to_road)
         if car_y is not None:
             low = np.array([CAR_X, car_y - CAR_SIZE[1] / 2, 0.02])
-            near = (low - SENSOR) / rays
+            to_low = (low - SENSOR) / rays
             far = (low + CAR_SIZE - SENSOR) / rays
-            enters = np.minimum(near, far).max(1)
-            leaves = np.maximum(near, far).min(1)
+            enters = np.minimum(to_low, far).max(1)
+            leaves = np.maximum(to_low, far).min(1)
             hit = (enters < leaves) & (enters > 0) & (enters < reach)
             reach[hit], label[hit] = enters[hit], CAR
     return SENSOR + rays * reach[:, None], label
@@ -133,10 +133,10 @@ def test_a_car_that_one_submap_still_holds_is_carved_by_the_next_one(
     ijk, label, *_ = submaps[0].occupied()
     assert on_track(ijk).sum() > 10
     assert CAR in label.tolist()
-    found, _ = session_map([submaps[i] for i in order], tmp_path)
-    assert found[on_track(found)].tolist() == []
+    ijk_left, _ = session_map([submaps[i] for i in order], tmp_path)
+    assert ijk_left[on_track(ijk_left)].tolist() == []
     expected = wall(submaps[1].occupied()[0])
-    assert len(wall(found) & expected) > 0.99 * len(expected)
+    assert len(wall(ijk_left) & expected) > 0.99 * len(expected)
 
 
 @pytest.mark.parametrize(("visits", "stays"), [(1, True), (2, False)])
@@ -144,10 +144,10 @@ def test_a_parked_car_that_left_is_gone_after_two_submaps_without_it(
     visits: int, stays: bool, tmp_path: Path
 ) -> None:
     """Clamped at 3.5 and -2 a submap, it takes two that saw the place free."""
-    found, label = session_map([fused([0.0] * 8), *([fused(NOBODY)] * visits)], tmp_path)
-    assert (CAR in label[on_track(found)].tolist()) == stays
+    ijk, label = session_map([fused([0.0] * 8), *([fused(NOBODY)] * visits)], tmp_path)
+    assert (CAR in label[on_track(ijk)].tolist()) == stays
 
 
 def test_a_car_that_every_submap_saw_stays(tmp_path: Path) -> None:
-    found, label = session_map([fused([0.0] * 8), fused([0.0] * 8)], tmp_path)
-    assert (label[on_track(found)] == CAR).sum() > 50
+    ijk, label = session_map([fused([0.0] * 8), fused([0.0] * 8)], tmp_path)
+    assert (label[on_track(ijk)] == CAR).sum() > 50

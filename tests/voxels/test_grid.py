@@ -51,9 +51,9 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
         )
         corner = one.bounds()[0]
         for cell in np.argwhere(one.log_odds.reshape(shape) != -128):
-            at = tuple(cell)
-            odds, state = (int(a.reshape(shape)[at]) for a in (one.log_odds, one.state))
-            hits = votes[n * 4096 + int(np.ravel_multi_index(at, shape))] if odds > 0 else 0
+            index = tuple(cell)
+            odds, state = (int(a.reshape(shape)[index]) for a in (one.log_odds, one.state))
+            hits = votes[n * 4096 + int(np.ravel_multi_index(index, shape))] if odds > 0 else 0
             out[tuple((cell + corner).tolist())] = odds, state, hits
         assert (one.state[one.log_odds == -128] == UNOBSERVED_STATE).all()
     assert len(low) == len(high)
@@ -77,17 +77,20 @@ def slow_reference(
                 continue
             ray = p - origin
             distance = float(np.linalg.norm(ray))
-            near = distance <= f.max_range
-            if near:
+            is_in_range = distance <= f.max_range
+            if is_in_range:
                 votes[tuple(np.floor(p / f.voxel_size).astype(int).tolist())][int(c)] += 1
-            end = p if near else origin + ray * (f.max_range / distance)
-            ends_in = (near, *np.floor(end / f.voxel_size).astype(int).tolist())
+            end = p if is_in_range else origin + ray * (f.max_range / distance)
+            ends_in = (is_in_range, *np.floor(end / f.voxel_size).astype(int).tolist())
             if ends_in in carved:  # one ray for each end voxel
                 continue
             carved.add(ends_in)
             base = np.floor(np.minimum(end, origin) / f.voxel_size).astype(int) - 2
             grid = walk(
-                origin / f.voxel_size - base, (end / f.voxel_size - base)[None], [near], (5, 5, 5)
+                origin / f.voxel_size - base,
+                (end / f.voxel_size - base)[None],
+                [is_in_range],
+                (5, 5, 5),
             )
             for cell in np.argwhere(grid):
                 key = tuple((cell + base).tolist())
@@ -126,17 +129,17 @@ def random_frames(seed: int, count: int = 6, points: int = 60) -> list[Frame]:
 def test_fusion_is_what_the_dictionary_says(walk: Walk, seed: int) -> None:
     frames = random_frames(seed)
     f = fusion()
-    found = as_dictionary(fused(frames, f))
-    assert found == slow_reference(walk, frames, f)
+    voxels = as_dictionary(fused(frames, f))
+    assert voxels == slow_reference(walk, frames, f)
     # the example has something of everything
-    assert {s for _, s, _ in found.values()} >= {2, 4, 8, FREE_STATE}
+    assert {s for _, s, _ in voxels.values()} >= {2, 4, 8, FREE_STATE}
 
 
 def one_point(
-    label: int, count: int = 1, at: tuple[float, float, float] = (3.25, 0.25, 0.25)
+    label: int, count: int = 1, position: tuple[float, float, float] = (3.25, 0.25, 0.25)
 ) -> Frame:
     return (
-        np.tile(np.array(at), (count, 1)),
+        np.tile(np.array(position), (count, 1)),
         np.full(count, label, np.uint8),
         np.array([0.25, 0.25, 0.25]),
     )
@@ -276,10 +279,10 @@ def test_a_map_far_from_the_origin_is_the_same_map(far: tuple[float, float, floa
         (np.round(p * 64) / 64 + 1 / 128, label, np.round(o * 64) / 64)
         for p, label, o in random_frames(5)
     ]
-    near = as_dictionary(fused(frames, f))
+    voxels = as_dictionary(fused(frames, f))
     moved = as_dictionary(fused([(p + shift, label, o + shift) for p, label, o in frames], f))
     offset = (shift / 0.25).astype(int)
-    assert moved == {tuple((np.array(k) + offset).tolist()): v for k, v in near.items()}
+    assert moved == {tuple((np.array(k) + offset).tolist()): v for k, v in voxels.items()}
 
 
 def test_dense_boxes_overlap_the_map_in_part() -> None:
@@ -323,8 +326,10 @@ def test_a_pose_takes_the_points_into_the_map() -> None:
     moved = Fuser(fusion())
     there = points @ pose[:3, :3].T + pose[:3, 3]
     moved.add(points, label, origin, map_T_points=pose)
-    at = pose[:3, :3] @ origin + pose[:3, 3]
-    assert as_dictionary(moved.finish()) == as_dictionary(fused([(there, label, at)], fusion()))
+    origin_in_map = pose[:3, :3] @ origin + pose[:3, 3]
+    assert as_dictionary(moved.finish()) == as_dictionary(
+        fused([(there, label, origin_in_map)], fusion())
+    )
 
 
 def test_rays_that_graze_the_ground_do_not_carve_it() -> None:

@@ -65,15 +65,15 @@ def small_map(
 def test_blocks_come_back_exactly(blocks: BlockMap, tmp_path: Path) -> None:
     path = tmp_path / "submap.parquet"
     write_blocks(path, blocks, METADATA)
-    found = read_blocks(path)
+    read = read_blocks(path)
     for name in ("keys", "log_odds", "state", "ballots", "votes"):
         a = getattr(blocks, name)
-        b = getattr(found, name)
+        b = getattr(read, name)
         np.testing.assert_array_equal(a, b)
         assert a.dtype == b.dtype
     assert not len(read_blocks(path, states_only=True).ballots)
     np.testing.assert_array_equal(read_blocks(path, states_only=True).state, blocks.state)
-    assert found.bounds()[0].tolist() == blocks.bounds()[0].tolist()
+    assert read.bounds()[0].tolist() == blocks.bounds()[0].tolist()
     assert read_metadata(path) == METADATA
 
 
@@ -90,17 +90,17 @@ def test_keyframes_come_back_to_the_grid_of_2_mm_each_in_its_row_group(tmp_path:
     path = part_path(tmp_path, 0)
     assert pq.ParquetFile(path).num_row_groups == 4
     for i, (frame, kept) in enumerate(zip(frames, passed, strict=True)):
-        found = read_keyframe(tmp_path, i)
-        np.testing.assert_array_equal(found.label, frame.label)
-        assert found.points.shape == frame.points.shape
-        np.testing.assert_allclose(found.points, frame.points, atol=1 / 1024 + 1e-6)
+        read = read_keyframe(tmp_path, i)
+        np.testing.assert_array_equal(read.label, frame.label)
+        assert read.points.shape == frame.points.shape
+        np.testing.assert_allclose(read.points, frame.points, atol=1 / 1024 + 1e-6)
         # the result equals the stored keyframe
-        np.testing.assert_array_equal(found.points, kept.points)
+        np.testing.assert_array_equal(read.points, kept.points)
         again = tmp_path / "again"
         again.mkdir(exist_ok=True)
-        list(keep_keyframes(again, [0], [found], METADATA))
+        list(keep_keyframes(again, [0], [read], METADATA))
         # what lies on the grid is kept exactly
-        np.testing.assert_array_equal(read_keyframe(again, 0).points, found.points)
+        np.testing.assert_array_equal(read_keyframe(again, 0).points, read.points)
     table = pq.read_table(path)
     assert table["keyframe"].to_pylist() == [0] * 5 + [2] * 7 + [3]
     assert table["stamp_ns"].to_pylist()[-1] == 10**18 + 3
@@ -135,10 +135,10 @@ def test_the_uncertainty_of_ranges_comes_back_where_there_is_any(tmp_path: Path)
     assert sigma is not None
     assert sigma.tolist() == [0.0, 0.25, 2.0]
     assert read_keyframe(tmp_path, 1).sigma is None
-    near = Keyframe(np.array([[1, 0, 0], [9, 0, 0]], np.float32), label[:2], sigma[:2]).near(
+    keyframe = Keyframe(np.array([[1, 0, 0], [9, 0, 0]], np.float32), label[:2], sigma[:2]).near(
         np.array([2.0, 0, 0]), 3.0
     )
-    assert (near.points.tolist(), near.label.tolist()) == ([[1, 0, 0]], [0])
+    assert (keyframe.points.tolist(), keyframe.label.tolist()) == ([[1, 0, 0]], [0])
 
 
 def test_missing_and_damaged_keyframes_and_blocks_are_refused(tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> 
     assert write_voxels(folder, submaps, METADATA, CLAMP) == len(expected)
     tiles = sorted(folder.rglob("*.parquet"))
     assert len(tiles) > 3
-    found: dict[tuple[int, ...], tuple[int, int, int]] = {}
+    voxels: dict[tuple[int, ...], tuple[int, int, int]] = {}
     for path in tiles:
         table = pq.ParquetFile(path).read()
         assert read_metadata(path) == METADATA
@@ -232,9 +232,9 @@ def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> 
             table["hits"].to_pylist(),
             strict=True,
         ):
-            assert tuple(k) not in found
-            found[tuple(k)] = tuple(v)
-    assert found == expected
+            assert tuple(k) not in voxels
+            voxels[tuple(k)] = tuple(v)
+    assert voxels == expected
     assert not list(tmp_path.rglob(".*"))
 
 
@@ -298,15 +298,15 @@ def test_a_bounding_box_reads_few_row_groups(tmp_path: Path) -> None:
     # each is a square of 128 x 128 voxels; the box lies in x over one border of them
     assert len(read) <= 2
     assert max(g.row_groups[0].num_rows for g in every) <= 16384
-    found = data.to_table(filter=box)
+    table = data.to_table(filter=box)
     query = (
         f"SELECT * FROM '{tmp_path}/voxels/**/*.parquet' "
         "WHERE ix BETWEEN 100 AND 166 AND iy BETWEEN 300 AND 366"
     )
     rows = duckdb.connect().execute(query).fetchall()
-    assert len(rows) == found.num_rows == 67 * 67
+    assert len(rows) == table.num_rows == 67 * 67
     assert {r[:2] for r in rows} == set(
-        zip(found["ix"].to_pylist(), found["iy"].to_pylist(), strict=True)
+        zip(table["ix"].to_pylist(), table["iy"].to_pylist(), strict=True)
     )
     assert {d.name for d in (tmp_path / "voxels").iterdir()} == {
         f"tile={x}_{y}" for x in (0, 1) for y in (0, 1)

@@ -103,7 +103,7 @@ def index(work: Workspace, names: list[str], budget: int = 10**6) -> Index:
     return Index(V, parts, budget)
 
 
-def found(index: Index, places: int, k: int = 5) -> list[Any]:
+def searched(index: Index, places: int, k: int = 5) -> list[Any]:
     m = index.search(near_cells(7, 30), k, 3, Allowed(np.ones(places, bool)))
     return [a.tolist() for a in (m.query, m.group, m.entry, m.distance, m.centre, m.yaw)]
 
@@ -114,7 +114,7 @@ def fresh(work: Workspace, names: list[str], tmp: Path, budget: int = 10**6) -> 
     shutil.rmtree(tmp, ignore_errors=True)
     for n in names:
         shutil.copytree(work.session(n).path, other.session(n).path)
-    return found(index(other, names, budget), len(groups(work, names)))
+    return searched(index(other, names, budget), len(groups(work, names)))
 
 
 def files(work: Workspace) -> list[Path]:
@@ -148,11 +148,11 @@ def test_adding_and_removing_is_a_fresh_index(
             make_session(work, name, number, (size, 3))
             names.add(name)
         now = sorted(names)
-        mine = index(work, now)
-        assert len(mine) == sum(len(s) for s, _ in segments(work, VARIANT, now)) - dead(work, now)
+        built = index(work, now)
+        assert len(built) == sum(len(s) for s, _ in segments(work, VARIANT, now)) - dead(work, now)
         if number + 1 == len(steps):
             for budget in (10**6, 60):
-                assert found(index(work, now, budget), len(groups(work, now))) == fresh(
+                assert searched(index(work, now, budget), len(groups(work, now))) == fresh(
                     work, now, tmp / "fresh", budget
                 )
         sizes = sorted((len(open_segment(p, VARIANT)) for p in files(work)), reverse=True)
@@ -174,8 +174,8 @@ def test_some_sessions_can_be_asked_for_and_the_others_stay(tmp_path: Path) -> N
     change = Change()
     assert [served for _, served in segments(work, VARIANT, ["b"], change)] == [{"b"}]
     assert (str(change), files(work)) == ("", before)
-    assert found(index(work, ["b"]), 2) == fresh(work, ["b"], tmp_path / "fresh")
-    assert found(index(work, ["b"], 20), 2) == fresh(work, ["b"], tmp_path / "fresh", 20)
+    assert searched(index(work, ["b"]), 2) == fresh(work, ["b"], tmp_path / "fresh")
+    assert searched(index(work, ["b"], 20), 2) == fresh(work, ["b"], tmp_path / "fresh", 20)
 
 
 def test_rows_are_those_of_the_variant_with_their_places(tmp_path: Path) -> None:
@@ -188,12 +188,13 @@ def test_rows_are_those_of_the_variant_with_their_places(tmp_path: Path) -> None
         (0, r) for r in range(5)
     ] + [(1, r) for r in range(4)]
     word, code = V.words(near_cells(301, 4))
-    at = [int(np.flatnonzero((segment.place == 1) & (segment.row == r))[0]) for r in range(4)]
-    assert segment.code[at].tolist() == code.tolist()
-    for r, w in zip(at, word.tolist(), strict=True):
+    entries = [int(np.flatnonzero((segment.place == 1) & (segment.row == r))[0]) for r in range(4)]
+    assert segment.code[entries].tolist() == code.tolist()
+    for r, w in zip(entries, word.tolist(), strict=True):
         assert segment.starts[w] <= r < segment.starts[w + 1]
     np.testing.assert_array_equal(
-        segment.centre[at], np.random.default_rng(3).uniform(-50, 50, (4, 3)).astype(np.float32)
+        segment.centre[entries],
+        np.random.default_rng(3).uniform(-50, 50, (4, 3)).astype(np.float32),
     )
     assert segment.yaw.tolist() == [0.25] * 9
 
@@ -202,9 +203,9 @@ def test_of_some_submaps_certain_rows_may_answer(tmp_path: Path) -> None:
     work = Workspace(tmp_path)
     for i, name in enumerate("ab"):
         make_session(work, name, i)
-    mine = index(work, ["a", "b"])
+    built = index(work, ["a", "b"])
     rows = {1: np.arange(25) % 3 == 0, 2: np.zeros(40, bool), 0: np.ones(40, bool)}
-    m = mine.search(near_cells(7, 30), 200, 4, Allowed(np.array([True, True, True, False]), rows))
+    m = built.search(near_cells(7, 30), 200, 4, Allowed(np.array([True, True, True, False]), rows))
     expected = [(0, e) for e in range(40)] + [(1, e) for e in range(0, 25, 3)]
     for q in range(30):
         assert (
@@ -250,7 +251,7 @@ def test_a_merge_is_the_file_of_a_fresh_segment(tmp_path: Path) -> None:
 def test_a_damaged_file_is_seen_and_built_again(tmp_path: Path) -> None:
     work = Workspace(tmp_path / "work")
     make_session(work, "a", 1)
-    good = found(index(work, ["a"]), 2)
+    good = searched(index(work, ["a"]), 2)
     (path,) = files(work)
     content = path.read_bytes()
     length = int.from_bytes(content[12:16], "little")
@@ -276,7 +277,7 @@ def test_a_damaged_file_is_seen_and_built_again(tmp_path: Path) -> None:
         assert path.read_bytes() == content
     with pytest.raises(WorkspaceError):
         open_segment(path, "semantic")
-    assert found(index(work, ["a"]), 2) == good
+    assert searched(index(work, ["a"]), 2) == good
 
 
 def test_damage_within_the_arrays_is_not_merged(tmp_path: Path) -> None:
@@ -294,7 +295,7 @@ def test_damage_within_the_arrays_is_not_merged(tmp_path: Path) -> None:
     for seed, name in enumerate("bc", 2):  # the third makes them merge
         make_session(work, name, seed)
         index(work, [name])
-    assert found(index(work, ["a", "b", "c"]), 6) == fresh(
+    assert searched(index(work, ["a", "b", "c"]), 6) == fresh(
         work, ["a", "b", "c"], tmp_path / "fresh"
     )
     for p in files(work):
@@ -356,7 +357,7 @@ def test_sessions_without_words_are_remembered(tmp_path: Path) -> None:
     work = Workspace(tmp_path)
     make_session(work, "a", 1, (0, 0))
     make_session(work, "b", 1, ())
-    assert found(index(work, ["a", "b"]), 2)[0] == []
+    assert searched(index(work, ["a", "b"]), 2)[0] == []
     change = Change()
     segments(work, VARIANT, ["a", "b"], change)
     assert str(change) == ""
@@ -377,14 +378,14 @@ def test_a_workspace_that_cannot_be_written_is_searched_in_memory(
     change = Change()
     segments(work, VARIANT, ["a"], change)
     assert "No space left" in str(change)
-    assert found(index(work, ["a", "b"]), 4) == expected
+    assert searched(index(work, ["a", "b"]), 4) == expected
     assert files(work) == []
 
 
 def _build(path: Path) -> list[Any]:
     work = Workspace(path)
     names = [f.name for f in work.sessions()]
-    return found(index(work, names), len(groups(work, names)))
+    return searched(index(work, names), len(groups(work, names)))
 
 
 def test_processes_that_build_at_once_find_the_same(tmp_path: Path) -> None:
@@ -401,10 +402,10 @@ def test_processes_that_build_at_once_find_the_same(tmp_path: Path) -> None:
 def test_an_open_index_outlives_its_files(tmp_path: Path) -> None:
     work = Workspace(tmp_path)
     make_session(work, "a", 1)
-    mine = index(work, ["a"])
-    before = found(mine, 2)
+    opened = index(work, ["a"])
+    before = searched(opened, 2)
     shutil.rmtree(work.path / "index")
-    assert found(mine, 2) == before
+    assert searched(opened, 2) == before
 
 
 # -- the budget

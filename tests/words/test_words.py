@@ -67,12 +67,12 @@ def test_cells_are_the_nearest_ones(vocabulary: Vocabulary) -> None:
     similarity = d @ vocabulary.cells.T
     ordered = -np.sort(-similarity, axis=1)
     for probes in (1, 3, 10, 50):
-        found = vocabulary.nearest_cells(d, probes)
-        assert found.shape == (300, min(probes, 10))
+        cells = vocabulary.nearest_cells(d, probes)
+        assert cells.shape == (300, min(probes, 10))
         np.testing.assert_allclose(
-            np.take_along_axis(similarity, found, 1), ordered[:, :probes], atol=TOLERANCE
+            np.take_along_axis(similarity, cells, 1), ordered[:, :probes], atol=TOLERANCE
         )
-        assert all(len(set(row)) == len(row) for row in found.tolist())
+        assert all(len(set(row)) == len(row) for row in cells.tolist())
 
 
 def slow_code(vocabulary: Vocabulary, d: F32, cell: int) -> tuple[int, F32]:
@@ -105,15 +105,15 @@ def test_bits_are_balanced_in_each_cell_and_say_something(vocabulary: Vocabulary
     word, code = vocabulary.words(d)
     bits = np.unpackbits(code.view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
     for cell in range(10):
-        mine = bits[word // 256 == cell]
-        if len(mine) >= 30:
-            assert mine.mean(0).min() > 0.35
-            assert mine.mean(0).max() < 0.65
-    near = np.clip(d + 0.01 * np.random.default_rng(0).standard_normal(d.shape), -1, 1).astype(
-        np.float32
-    )
-    near /= np.linalg.norm(near, axis=1, keepdims=True)
-    moved = vocabulary.codes(near, word // 256)
+        bits_of_cell = bits[word // 256 == cell]
+        if len(bits_of_cell) >= 30:
+            assert bits_of_cell.mean(0).min() > 0.35
+            assert bits_of_cell.mean(0).max() < 0.65
+    moved_a_little = np.clip(
+        d + 0.01 * np.random.default_rng(0).standard_normal(d.shape), -1, 1
+    ).astype(np.float32)
+    moved_a_little /= np.linalg.norm(moved_a_little, axis=1, keepdims=True)
+    moved = vocabulary.codes(moved_a_little, word // 256)
     distance = np.array([(int(a) ^ int(b)).bit_count() for a, b in zip(code, moved, strict=True)])
     other = np.array(
         [(int(a) ^ int(b)).bit_count() for a, b in zip(code, np.roll(code, 7), strict=True)]
@@ -133,14 +133,14 @@ def slow_search(
     """Asymmetric and Hamming distances and rows of the k nearest ``allowed`` (n,) entries in the
     ``cells`` of one descriptor.
     """
-    found = []
+    candidates = []
     for e in np.flatnonzero(np.isin(word // 256, cells) & allowed):
         margin = v.projected(d[None])[0].astype(float) - v.thresholds[word[e] // 256]
         differs = [(int(code[e]) >> b & 1) != (margin[b] > 0) for b in range(BITS)]
-        found.append((float(np.abs(margin[differs]).sum()), sum(differs), int(e)))
+        candidates.append((float(np.abs(margin[differs]).sum()), sum(differs), int(e)))
     size = max(SHORTLIST, k)
-    farthest = sorted(f[1] for f in found)[min(size, len(found)) - 1] if found else 0
-    return sorted(f for f in found if f[1] <= farthest)[:k]
+    farthest = sorted(f[1] for f in candidates)[min(size, len(candidates)) - 1] if candidates else 0
+    return sorted(f for f in candidates if f[1] <= farthest)[:k]
 
 
 @given(
@@ -169,10 +169,10 @@ def test_the_nearest_words_are_those_of_brute_force(
                 v, word, code, q[i], cells[i], 300, allowed[group]
             )
         }
-        mine = m.query == i
-        entries = m.entry[mine].tolist()
+        of_query = m.query == i
+        entries = m.entry[of_query].tolist()
         assert len(set(entries)) == len(entries) == len(expected)
-        assert m.distance[mine].tolist() == [row[e][1] for e in entries]
+        assert m.distance[of_query].tolist() == [row[e][1] for e in entries]
         np.testing.assert_allclose(
             [row[e][0] for e in entries], [f[0] for f in expected], rtol=1e-6, atol=1e-7
         )
@@ -197,19 +197,19 @@ def test_what_is_found_does_not_depend_on_the_other_queries() -> None:
     """The bound that a query begins with is the one before's: far and near queries in either order,
     and alone, find the same.
     """
-    near = unit(3, 400)
+    close = unit(3, 400)
     far = unit(77, 30, centres=3, spread=3.0)
-    word, code = TRAINED.words(near)
+    word, code = TRAINED.words(close)
     index = Index.of_words(TRAINED, word, code, np.zeros(400, np.int64))
-    mixed = np.stack([near[:30], far], 1).reshape(60, 256)
+    mixed = np.stack([close[:30], far], 1).reshape(60, 256)
 
-    def found(q: F32) -> list[tuple[int, int, int]]:
+    def searched(q: F32) -> list[tuple[int, int, int]]:
         m = index.search(q, 5, 3, ALL)
         return list(zip(m.query.tolist(), m.entry.tolist(), m.distance.tolist(), strict=True))
 
-    together = found(mixed)
-    assert sorted((59 - q, e, d) for q, e, d in found(mixed[::-1])) == sorted(together)
-    assert [(q + i, e, d) for i in range(60) for q, e, d in found(mixed[i : i + 1])] == together
+    together = searched(mixed)
+    assert sorted((59 - q, e, d) for q, e, d in searched(mixed[::-1])) == sorted(together)
+    assert [(q + i, e, d) for i in range(60) for q, e, d in searched(mixed[i : i + 1])] == together
 
 
 def test_a_bit_that_is_sure_outweighs_two_that_are_not() -> None:
@@ -263,11 +263,11 @@ def test_kmeans_finds_clusters_that_lie_apart() -> None:
     data = np.concatenate([c + 0.005 * rng.standard_normal((40, 2)) for c in centres]).astype(
         np.float32
     )
-    found = kmeans(data, 5, np.random.default_rng(3), 15)
-    assert (((data[:, None] - found) ** 2).sum(2).min(1)).sum() < 0.25 * (
+    means = kmeans(data, 5, np.random.default_rng(3), 15)
+    assert (((data[:, None] - means) ** 2).sum(2).min(1)).sum() < 0.25 * (
         (data - data.mean(0)) ** 2
     ).sum()
-    assert np.isfinite(found).all()
+    assert np.isfinite(means).all()
 
 
 class Picks:
@@ -355,11 +355,11 @@ def test_a_cell_of_few_descriptors_has_half_as_many_words() -> None:
     words = v.words(d)[0]
     own = v.nearest_cells(d, 1)[:, 0]
     for cell in range(9):
-        mine = int((own == cell).sum())
+        count = int((own == cell).sum())
         kids = v.children[cell]
         assert kids.shape == (256, BITS)
-        assert len(np.unique(kids, axis=0)) <= max(1, mine // 2)
-        assert (words[own == cell] % 256 < max(1, mine // 2)).all()
+        assert len(np.unique(kids, axis=0)) <= max(1, count // 2)
+        assert (words[own == cell] % 256 < max(1, count // 2)).all()
 
 
 def test_children_of_more_words_lie_nearer() -> None:
@@ -381,19 +381,19 @@ def test_children_of_more_words_lie_nearer() -> None:
 def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_path: Path) -> None:
     path = tmp_path / "vocabulary.safetensors"
     save_vocabulary(path, vocabulary, {"trained_on": "random"})
-    found = load_vocabulary("geometric", path)
+    loaded = load_vocabulary("geometric", path)
     for k in ("cells", "projection", "children"):
-        np.testing.assert_array_equal(getattr(found, k), getattr(vocabulary, k))
+        np.testing.assert_array_equal(getattr(loaded, k), getattr(vocabulary, k))
     assert load_file(path)["children"].dtype == np.int8
-    np.testing.assert_allclose(found.thresholds, vocabulary.thresholds, atol=1e-3)
+    np.testing.assert_allclose(loaded.thresholds, vocabulary.thresholds, atol=1e-3)
     d = unit(5, 200)
-    word, code = found.words(d)
+    word, code = loaded.words(d)
     own_word, own_code = vocabulary.words(d)
     assert word.tolist() == own_word.tolist()
     different = np.unpackbits((code ^ own_code).view(np.uint8)).sum()
     assert different < 0.002 * 64 * 200  # the thresholds alone lose digits
     again = tmp_path / "again.safetensors"
-    save_vocabulary(again, found, {"trained_on": "random"})
+    save_vocabulary(again, loaded, {"trained_on": "random"})
     assert again.read_bytes() == path.read_bytes()
 
 
@@ -406,9 +406,9 @@ def test_children_of_half_precision_are_rounded_to_bytes(
     }
     children = np.array([[[0.1] * 64, [0.9] * 64]] * 10, np.float16)
     save_file(halves | {"children": children}, tmp_path / "old.safetensors")
-    found = load_vocabulary("geometric", tmp_path / "old.safetensors").children
-    assert found[:, 0].tolist() == [[26 / 256] * 64] * 10
-    assert found[:, 1].tolist() == [[127 / 256] * 64] * 10  # the end of the range
+    children_read = load_vocabulary("geometric", tmp_path / "old.safetensors").children
+    assert children_read[:, 0].tolist() == [[26 / 256] * 64] * 10
+    assert children_read[:, 1].tolist() == [[127 / 256] * 64] * 10  # the end of the range
 
 
 def test_files_that_hold_no_vocabulary_are_refused_by_name(
@@ -467,10 +467,10 @@ print(digest.hexdigest())
 
 
 def test_words_do_not_depend_on_the_number_of_threads() -> None:
-    found = set()
+    outputs = set()
     for threads in ("1", "2", "3"):
         environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-        found.add(
+        outputs.add(
             subprocess.run(
                 [sys.executable, "-c", SCRIPT],
                 env=environment,
@@ -479,4 +479,4 @@ def test_words_do_not_depend_on_the_number_of_threads() -> None:
                 text=True,
             ).stdout
         )
-    assert len(found) == 1
+    assert len(outputs) == 1

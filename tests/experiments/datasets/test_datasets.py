@@ -102,8 +102,8 @@ def test_kittis_points_fall_into_its_pictures_where_its_projection_puts_them(
         expected = P @ tr @ np.append(POINTS[0], 1.0)
         camera_T_base = inverse(session.base_T_sensors()[f"camera_{name}_optical"])
         K = session.cameras[f"/camera/{name}/image_rect/compressed"].K
-        found = K @ apply(camera_T_base, np.array([POINTS[0]]))[0]
-        assert found[:2] / found[2] == pytest.approx(expected[:2] / expected[2])
+        projected = K @ apply(camera_T_base, np.array([POINTS[0]]))[0]
+        assert projected[:2] / projected[2] == pytest.approx(expected[:2] / expected[2])
     right = session.cameras["/camera/right/image_rect/compressed"]
     # 54 / 100 m to the right of the left one
     assert right.P[0, 3] == pytest.approx(-54.0)

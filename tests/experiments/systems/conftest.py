@@ -74,13 +74,13 @@ class Town:
         ).reshape(-1, 3)
         start = world_T_base[:3, :3] @ SENSOR + world_T_base[:3, 3]
         far, label = self.distances(start, rays @ world_T_base[:3, :3].T)
-        near = far < 40.0
-        points = (SENSOR + rays[near] * far[near, None]).astype(np.float32)
+        is_in_range = far < 40.0
+        points = (SENSOR + rays[is_in_range] * far[is_in_range, None]).astype(np.float32)
         return View(
             "town",
             stamp_ns,
             points,
-            label[near],
+            label[is_in_range],
             SENSOR.astype(np.float32),
             world_T_base.copy(),
             world_T_base,
@@ -137,13 +137,13 @@ def town() -> Town:
     for x in np.arange(-25.0, 70.0, 9.0):
         for side in (-1.0, 1.0):
             depth, width, height = rng.uniform([4, 3, 3], [8, 7, 9])
-            near = rng.uniform(6.0, 11.0)
-            y = sorted((side * near, side * (near + depth)))
+            distance = rng.uniform(6.0, 11.0)
+            y = sorted((side * distance, side * (distance + depth)))
             left = x + rng.uniform(0, 2)
             boxes.append([[left, y[0], 0.0], [left + width, y[1], height]])
             if rng.random() < 0.5:  # a kiosk
-                at = x + rng.uniform(0, 8)
-                boxes.append([[at, side * 5.0 - 0.5, 0.0], [at + 1.2, side * 5.0 + 0.5, 2.2]])
+                start = x + rng.uniform(0, 8)
+                boxes.append([[start, side * 5.0 - 0.5, 0.0], [start + 1.2, side * 5.0 + 0.5, 2.2]])
     return Town(np.array(boxes), rng.random((48, 48, 48)))
 
 
@@ -184,8 +184,8 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> SystemOptions:
 def errors() -> Callable[[RankedPose, F64], tuple[float, float]]:
     """Metres and degrees by which a pose is wrong."""
 
-    def of(found: RankedPose, truth: F64) -> tuple[float, float]:
-        off = inverse(truth) @ found.world_T_base
+    def of(pose: RankedPose, truth: F64) -> tuple[float, float]:
+        off = inverse(truth) @ pose.world_T_base
         turn = np.degrees(np.arccos(np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1)))
         return float(np.linalg.norm(off[:3, 3])), float(turn)
 

@@ -29,8 +29,8 @@ from semloc_logs.numerics.transforms import (
 
 def test_a_level_pose_keeps_heading_and_place() -> None:
     tilted = yaw_transform(0.7, (1.0, 2.0, 3.0)) @ exp_se3(np.zeros(3), np.array([0.1, 0.0, 0.0]))
-    found = level_pose(tilted)
-    np.testing.assert_allclose(found, yaw_transform(0.7, (1.0, 2.0, 3.0)), atol=1e-9)
+    level = level_pose(tilted)
+    np.testing.assert_allclose(level, yaw_transform(0.7, (1.0, 2.0, 3.0)), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["own", "small_gicp", "kiss_matcher"])
@@ -85,9 +85,9 @@ def test_density_maps_find_the_scan_and_the_turn_but_none_of_the_queries(town: A
     scan_T_points = yaw_transform(1.2, (0.5, -0.4, 0.0))
     turned = apply(inverse(scan_T_points), scans[1]).astype(np.float32)
     for _ in range(3):  # the library knows the first query by the second time
-        (number, found), *_ = places.nearest(turned, 2)
+        (number, scan_T_query), *_ = places.nearest(turned, 2)
         assert number == 1
-        off = inverse(scan_T_points) @ found
+        off = inverse(scan_T_points) @ scan_T_query
         assert np.linalg.norm(off[:2, 3]) < 1.0  # two cells of the map
         assert rotation_angle(off[:3, :3]) < 0.05
     assert all(number < 3 for number, _ in places.nearest(turned, 20))

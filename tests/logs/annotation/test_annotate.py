@@ -191,8 +191,12 @@ def test_a_bag_gets_a_copy_that_is_a_bag(tmp_path: Path) -> None:
             for c, _, raw in any_reader.messages()
             if c.topic == "/semloc/loop_closures"
         ]
-    (found,) = read
-    assert (found.query_session, found.target_session, found.t_x) == ("a", "b", 1.0)
+    (closure_read,) = read
+    assert (closure_read.query_session, closure_read.target_session, closure_read.t_x) == (
+        "a",
+        "b",
+        1.0,
+    )
 
     # a copy of the copy replaces the results
     again = annotate_copy(copy, tmp_path / "again.bag", results)
@@ -245,10 +249,10 @@ def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
     annotate_copy(first, second, Results([closure()], "a", {}, log_times={}))
     assert first.read_bytes() == second.read_bytes()
     with Reader2(second) as reader:
-        found = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}  # type: ignore[union-attr]
+        profiles_of = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}  # type: ignore[union-attr]
     ours = ["/semloc/loop_closures", "/semloc/markers", "/semloc/pose", "/semloc/pose/b"]
-    assert sorted(found) == ["/one", *ours]
-    assert all(profiles == [qos] for profiles in found.values())
+    assert sorted(profiles_of) == ["/one", *ours]
+    assert all(profiles == [qos] for profiles in profiles_of.values())
 
 
 def test_markers_are_defined_as_in_the_log(tmp_path: Path) -> None:
@@ -414,8 +418,11 @@ def test_real_ros2_logs(shared: Callable[[str], Path], tmp_path: Path, name: str
         expected = original.message_count
     with AnyReader([out]) as reader:
         assert reader.message_count == expected + 6
-        mine = [c for c in reader.connections if c.topic.startswith("/semloc/")]
-        assert len([reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(mine)]) == 6
+        connections = [c for c in reader.connections if c.topic.startswith("/semloc/")]
+        assert (
+            len([reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(connections)])
+            == 6
+        )
     with out.open("rb") as file:
         decoded = list(
             make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(

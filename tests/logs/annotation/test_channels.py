@@ -114,8 +114,8 @@ def test_every_column_comes_back(encoding: Encoding) -> None:
 def test_pose_of_the_query_in_the_frame_of_the_target(encoding: Encoding) -> None:
     pose = transform(np.array([10.0, 20.0, 30.0]), np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]))
     closure = ClosureRecord.from_row(ROW, session_T_query=pose)
-    found = decoded([closure], "wet_monday", encoding)["/semloc/pose"]
-    ((_, message),) = found
+    messages = decoded([closure], "wet_monday", encoding)["/semloc/pose"]
+    ((_, message),) = messages
     inner = message.pose.pose if encoding.startswith("ros") else message.pose
     assert (inner.position.x, inner.position.y, inner.position.z) == (10.0, 20.0, 30.0)
     assert np.allclose([inner.orientation.z, inner.orientation.w], np.sqrt(0.5))
@@ -186,14 +186,14 @@ def test_markers_show_the_place_and_the_other_end() -> None:
         session_T_query=yaw_transform(0.0, (4.0, 0.0, 0.0)),
         session_position=np.array([5.0, 0.0, 0.0]),
     )
-    found = decoded([closure], "wet_monday", "ros2")
-    shown = {topic: len(found[topic]) for topic in TOPICS if found[topic]}
+    messages = decoded([closure], "wet_monday", "ros2")
+    shown = {topic: len(messages[topic]) for topic in TOPICS if messages[topic]}
     assert shown == {  # one message each, at the query's end
         "/semloc/loop_closures": 1,
         "/semloc/pose": 1,
         "/semloc/markers": 1,
     }
-    sphere, line, text = found["/semloc/markers"][0][1].markers
+    sphere, line, text = messages["/semloc/markers"][0][1].markers
     assert (sphere.type, line.type, text.type) == (2, 5, 9)
     assert {m.header.frame_id for m in (sphere, line, text)} == {"odom"}
     assert all(m.frame_locked for m in (sphere, line, text))  # as the overview is
@@ -234,13 +234,13 @@ def test_times_and_order() -> None:
         return ClosureRecord.from_row(ROW | {"query_stamp_ns": stamp, "words": stamp})
 
     closures = [one(stamp) for stamp in (14, 13, 25, 5)]
-    found = decoded(
+    messages = decoded(
         [*closures, ClosureRecord.from_row(ROW | {"query_session": "other"})],
         "wet_monday",
         "ros2",
         {14: 11, 13: 12},
     )
-    assert [(t, m.words) for t, m in found["/semloc/loop_closures"]] == [
+    assert [(t, m.words) for t, m in messages["/semloc/loop_closures"]] == [
         (10, 5),
         (11, 14),
         (12, 13),
@@ -249,10 +249,10 @@ def test_times_and_order() -> None:
 
 
 def test_as_target_the_time_is_that_of_the_target() -> None:
-    found = decoded(
+    messages = decoded(
         [ClosureRecord.from_row(ROW)], "dry_sunday", "ros2", {1_600_000_000_987_654_321: 17}
     )
-    ((time, message),) = found["/semloc/loop_closures"]
+    ((time, message),) = messages["/semloc/loop_closures"]
     assert (time, message.header.stamp.sec, message.query_session) == (
         17,
         1_600_000_000,
@@ -369,10 +369,10 @@ def test_run_id_follows_content() -> None:
 def test_each_target_has_a_topic_of_its_poses(encoding: Encoding) -> None:
     sunday = ClosureRecord.from_row(ROW, session_T_query=np.eye(4))
     friday = ClosureRecord.from_row(ROW | {"target_session": "friday"}, session_T_query=np.eye(4))
-    found = decoded([sunday, friday], "wet_monday", encoding)
-    assert len(found["/semloc/pose"]) == 2
+    messages = decoded([sunday, friday], "wet_monday", encoding)
+    assert len(messages["/semloc/pose"]) == 2
     for target in ("dry_sunday", "friday"):
-        ((_, message),) = found[f"/semloc/pose/{target}"]
+        ((_, message),) = messages[f"/semloc/pose/{target}"]
         in_ros = encoding.startswith("ros")
         frame_id = message.header.frame_id if in_ros else message.frame_id
         assert frame_id == f"semloc/{target}"
@@ -393,14 +393,14 @@ def test_topics_are_names_that_ros_allows() -> None:
 def test_poses_in_the_common_frame_replace_the_ones_of_targets(encoding: Encoding) -> None:
     closure = ClosureRecord.from_row(ROW, session_T_query=np.eye(4))
     pose = StampedPose(12, "semloc/common", yaw_transform(0.0, (1.0, 2.0, 3.0)), np.zeros((6, 6)))
-    found = decoded([closure], "wet_monday", encoding, scene=Scene(common=[pose]))
-    ((time, message),) = found["/semloc/pose"]
+    messages = decoded([closure], "wet_monday", encoding, scene=Scene(common=[pose]))
+    ((time, message),) = messages["/semloc/pose"]
     in_ros = encoding.startswith("ros")
     inner = message.pose.pose if in_ros else message.pose
     assert time == 12
     assert (message.header if in_ros else message).frame_id == "semloc/common"
     assert (inner.position.x, inner.position.y, inner.position.z) == (1.0, 2.0, 3.0)
-    assert len(found["/semloc/pose/dry_sunday"]) == 1
+    assert len(messages["/semloc/pose/dry_sunday"]) == 1
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -409,8 +409,8 @@ def test_the_map_is_a_cloud_at_the_start(encoding: Encoding) -> None:
     colours = np.array([[128, 64, 127], [1, 2, 3]], np.uint8)
     cloud = Cloud("odom", points, colours, np.array([0, 255], np.uint8))
     closure = ClosureRecord.from_row(ROW)
-    found = decoded([closure], "wet_monday", encoding, scene=Scene(cloud=cloud))
-    ((time, message),) = found["/semloc/map"]
+    messages = decoded([closure], "wet_monday", encoding, scene=Scene(cloud=cloud))
+    ((time, message),) = messages["/semloc/map"]
     assert time == 10
     if encoding.startswith("ros"):
         assert (message.width, message.height, message.header.frame_id) == (2, 1, "odom")
@@ -456,9 +456,9 @@ def test_one_message_at_the_start_has_all_drives_and_closures(encoding: Encoding
         Drive("wet_monday", "odom", way, orange),
         Drive("dry_sunday", "semloc/dry_sunday", way + 1.0, orange),
     ]
-    found = decoded(closures, "wet_monday", encoding, scene=Scene(drives=drives))
-    assert [time for time, _ in found["/semloc/markers"]] == [14, 15]
-    ((time, message),) = found["/semloc/overview"]
+    messages = decoded(closures, "wet_monday", encoding, scene=Scene(drives=drives))
+    assert [time for time, _ in messages["/semloc/markers"]] == [14, 15]
+    ((time, message),) = messages["/semloc/overview"]
     assert time == 10
     red_and_green = [(0.0, 1.0), (1.0, 0.0)]  # sure, unsure
     if encoding.startswith("ros"):

@@ -113,17 +113,17 @@ KINDS = ("first", "longer", "shorter", "equal")
 
 def every_state(disk: LossyDisk, action: Callable[[], object]) -> tuple[list[Tree], list[Tree]]:
     """All states that a crash may leave while ``action`` runs, and those after it has ended."""
-    found: list[Tree] = []
+    states: list[Tree] = []
 
     def look() -> None:
-        found.extend(state for state in disk.states() if state not in found)
+        states.extend(state for state in disk.states() if state not in states)
 
     disk.visit = look
     with disk.watching(), contextlib.suppress(Crash):
         action()
     disk.visit = lambda: None
     last = list(disk.states())
-    return found + [state for state in last if state not in found], last
+    return states + [state for state in last if state not in states], last
 
 
 def mended(state: Tree, folder: Path) -> Tree | str:
@@ -210,8 +210,8 @@ def test_power_failure_while_a_killed_run_is_repaired(tmp_path: Path, kind: str)
     states: list[Tree] = []
     for disk, log in killed_disks(made, tmp_path):
         done: list[bool] = []
-        found, last = every_state(disk, partial(note_repair, done, log))
-        states += [state for state in found if state not in states]
+        while_repaired, last = every_state(disk, partial(note_repair, done, log))
+        states += [state for state in while_repaired if state not in states]
         if done == [True]:  # a repair is durable when the function returns
             assert last in ([{"log.mcap": made.before}], [{"log.mcap": made.after}])
             repairs += 1
@@ -384,8 +384,8 @@ def test_kill_at_every_step_of_a_new_file(tmp_path: Path, mode: str) -> None:
     assert topics(folders[-1] / "out.mcap").count("/semloc/loop_closures") == 3
     assert len(folders) > FILE_SYNCS
     for folder in folders:
-        found = {p.name: p.read_bytes() for p in folder.iterdir() if p.name[0] != "."}
-        assert found in ({"log.mcap": original}, {"log.mcap": original, "out.mcap": new})
+        contents = {p.name: p.read_bytes() for p in folder.iterdir() if p.name[0] != "."}
+        assert contents in ({"log.mcap": original}, {"log.mcap": original, "out.mcap": new})
 
 
 # -- full disk
@@ -497,9 +497,11 @@ def test_a_rerun_replaces_earlier_results_everywhere(tmp_path: Path) -> None:
             else:
                 report = write(log, output, results(count), overwrite=True)
                 made = output
-            found = topics(made)
-            assert report.closures == found.count("/semloc/loop_closures") == count
-            assert found.count("/semloc/pose") == found.count("/semloc/markers") == count
+            topics_read = topics(made)
+            assert report.closures == topics_read.count("/semloc/loop_closures") == count
+            assert (
+                topics_read.count("/semloc/pose") == topics_read.count("/semloc/markers") == count
+            )
             sizes.append(made.stat().st_size)
         assert sizes[1] < sizes[2] == sizes[3] < sizes[0]
 

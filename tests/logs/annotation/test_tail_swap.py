@@ -83,10 +83,10 @@ def test_a_saved_end_of_another_user_is_not_used(
     own = side.stat()
 
     def fstat(handle: int) -> os.stat_result:
-        found = real(handle)
-        if found.st_ino != own.st_ino:
-            return found
-        return os.stat_result((*found[:4], own.st_uid + 1, *found[5:]))
+        status = real(handle)
+        if status.st_ino != own.st_ino:
+            return status
+        return os.stat_result((*status[:4], own.st_uid + 1, *status[5:]))
 
     monkeypatch.setattr(os, "fstat", fstat)
     with pytest.raises(LogError, match="is a file of another user, so it was not used"):

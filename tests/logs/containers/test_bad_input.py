@@ -36,9 +36,9 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 def rows(dtype: Any = XYZ, count: int = 60) -> NDArray[np.void]:
     """Points on a wall 5 m ahead."""
-    found = np.zeros(count, dtype)
-    found["x"], found["y"], found["z"] = 5, np.arange(count), 1
-    return found
+    points = np.zeros(count, dtype)
+    points["x"], points["y"], points["z"] = 5, np.arange(count), 1
+    return points
 
 
 def stage(log: Any, seconds: float = 2.0) -> None:
@@ -370,8 +370,8 @@ def png_head(width: int, height: int, depth: int = 8, colour: int = 2, body: byt
 
 def jpeg_head(width: int, height: int) -> bytes:
     data = bytearray(np.array(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1]).tobytes())
-    at = data.index(b"\xff\xc0")
-    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    start = data.index(b"\xff\xc0")
+    data[start + 5 : start + 9] = struct.pack(">HH", height, width)
     return bytes(data)
 
 

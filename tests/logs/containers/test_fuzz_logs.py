@@ -66,7 +66,7 @@ def ros_messages(store: Any) -> dict[str, Any]:
     edge = t["geometry_msgs/msg/TransformStamped"](
         header=header, child_frame_id="c", transform=transform
     )
-    found = {
+    messages = {
         "/cloud": t["sensor_msgs/msg/PointCloud2"](
             header=header, data=data, is_dense=True, **layout
         ),
@@ -84,8 +84,8 @@ def ros_messages(store: Any) -> dict[str, Any]:
         "/pose": edge,
     }
     if store is ROS2:
-        found["/tf"] = t["tf2_msgs/msg/TFMessage"](transforms=[edge, edge])
-    return found
+        messages["/tf"] = t["tf2_msgs/msg/TFMessage"](transforms=[edge, edge])
+    return messages
 
 
 @cache
@@ -124,19 +124,19 @@ def recorded(kind: str) -> dict[str, bytes]:
 
 def damaged(data: st.DataObject, content: bytes) -> bytes:
     """Some bytes overwritten, and perhaps the end or a piece cut out."""
-    found = bytearray(content)
+    out = bytearray(content)
     for _ in range(data.draw(st.integers(0, 4))):
-        at = data.draw(st.integers(0, len(found) - 1))
+        start = data.draw(st.integers(0, len(out) - 1))
         value = data.draw(
             st.sampled_from([b"\xff", b"\0", b"\xff" * 4, b"\0\0\0\x7f", b"\xff" * 8, b"A"])
             | st.binary(min_size=1, max_size=8)
         )
-        found[at : at + len(value)] = value
+        out[start : start + len(value)] = value
     cut = data.draw(st.sampled_from(["", "", "end", "piece"]))
     if cut:
-        at = data.draw(st.integers(0, len(found)))
-        found[at : at + data.draw(st.integers(1, 40)) if cut == "piece" else len(found)] = b""
-    return bytes(found)
+        start = data.draw(st.integers(0, len(out)))
+        out[start : start + data.draw(st.integers(1, 40)) if cut == "piece" else len(out)] = b""
+    return bytes(out)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap zstd", "rosbag1", "rosbag2"])

@@ -178,8 +178,8 @@ def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> Non
     data = bytearray(path.read_bytes())
     start = int.from_bytes(data[-28:-20], "little")
     old = summary.chunk_indexes[0].chunk_start_offset.to_bytes(8, "little")
-    at = data.index(old, start)
-    data[at : at + 8] = (1 << 60).to_bytes(8, "little")
+    offset = data.index(old, start)
+    data[offset : offset + 8] = (1 << 60).to_bytes(8, "little")
     # a liar that knows how to count
     data[-12:-8] = zlib.crc32(bytes(data[start:-12])).to_bytes(4, "little")
     path.write_bytes(data)

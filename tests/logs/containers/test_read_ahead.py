@@ -48,15 +48,15 @@ def test_a_damaged_chunk_fails_when_its_turn_has_come() -> None:
         return part.encode()
 
     parts = ["a", "bad", "c"]
-    found = []
+    outcomes = []
     memory = Memory()
     with ReadAhead(parts, lambda _: 1, unpack, memory) as ahead:
         for part in parts:
             try:
-                found.append(ahead.take(part))
+                outcomes.append(ahead.take(part))
             except LogError as error:
-                found.append(str(error).encode())
-    assert found == [b"a", b"it is damaged", b"c"]
+                outcomes.append(str(error).encode())
+    assert outcomes == [b"a", b"it is damaged", b"c"]
     assert memory.used == 0
 
 

@@ -71,9 +71,9 @@ def check(log: Log, times: list[int], encoding: str) -> None:
     """The whole content of a log of ``times``."""
     assert [m.log_time_ns for m in log.messages()] == sorted(times)
     assert [m.log_time_ns for m in log.messages(["/b"])] == sorted(times[1::2])
-    found = list(log.frames())
-    assert all(isinstance(f, PoseSample) for f in found)
-    assert [f.frame_T_child[0, 3] for f in found if isinstance(f, PoseSample)] == sorted(times)
+    frames = list(log.frames())
+    assert all(isinstance(f, PoseSample) for f in frames)
+    assert [f.frame_T_child[0, 3] for f in frames if isinstance(f, PoseSample)] == sorted(times)
     assert (log.start_ns, log.end_ns) == (min(times), max(times))
     counts = len(times) - len(times) // 2, len(times) // 2
     assert log.streams == [
@@ -100,8 +100,8 @@ def test_ros1(tmp_path: Path, compression: Any, times: list[int]) -> None:
 def test_ros1_without_its_index(tmp_path: Path) -> None:
     path = bag1(tmp_path / "x.bag", TIMES)
     data = path.read_bytes()
-    at = data.index(b"index_pos=") + len(b"index_pos=")
-    path.write_bytes(data[:at] + bytes(8) + data[at + 8 :])
+    start = data.index(b"index_pos=") + len(b"index_pos=")
+    path.write_bytes(data[:start] + bytes(8) + data[start + 8 :])
     log = open_log(path)
     check(log, TIMES, "ros1")
     assert "was not closed" in sentences(log.problems)[0]

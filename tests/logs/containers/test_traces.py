@@ -40,12 +40,12 @@ def payload(k: int) -> bytes:
 
 def listing(folder: Path) -> Listing:
     """Content, time of change and mode of every file, and of the folder."""
-    found: Listing = {}
+    files: Listing = {}
     for path in [folder, *folder.rglob("*")]:
         status = path.stat()
         content = path.read_bytes() if path.is_file() else b""
-        found[str(path)] = (content, status.st_mtime_ns, status.st_mode)
-    return found
+        files[str(path)] = (content, status.st_mtime_ns, status.st_mode)
+    return files
 
 
 def make(database: sqlite3.Connection) -> None:

@@ -22,8 +22,8 @@ S = 1_000_000_000
 
 
 def inspect(path: Path, topics: dict[str, str] | None = None) -> dict[str, Any]:
-    found = inspect_log(path, topics)
-    content: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
+    inspection = inspect_log(path, topics)
+    content: dict[str, Any] = json.loads(json.dumps(inspection, allow_nan=False))
     assert {"path", "format", "start_ns", "end_ns", "streams", "problems"} <= set(content)
     assert set(content["skipped"]) <= set(content["problems"])
     return content
@@ -157,10 +157,10 @@ def test_recorded_logs(
     content = inspect(shared(f"logs/{name}"))
     assert content["base_frame"] == base
     assert content["poses"]["count"] == poses
-    found: dict[str, int] = {}
+    count_of_role: dict[str, int] = {}
     for stream in content["streams"]:
-        found[stream["role"]] = found.get(stream["role"], 0) + stream["count"]
-    assert found == roles
+        count_of_role[stream["role"]] = count_of_role.get(stream["role"], 0) + stream["count"]
+    assert count_of_role == roles
     assert content["skipped"] == []
 
 
@@ -197,8 +197,8 @@ def test_cut_off_and_scribbled_logs(
         )
     for _ in range(3):
         damaged = bytearray(data)
-        at = int(rng.integers(len(data) // 10, len(data) * 9 // 10))
-        damaged[at : at + 4096] = rng.bytes(4096)
+        start = int(rng.integers(len(data) // 10, len(data) * 9 // 10))
+        damaged[start : start + 4096] = rng.bytes(4096)
         (tmp_path / name).write_bytes(damaged)
         assert inspect(tmp_path / name)["skipped"]
 

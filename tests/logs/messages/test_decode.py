@@ -486,17 +486,17 @@ def test_cut_off_messages_are_named(ros: Ros) -> None:
 
 
 def descriptors(message: Any) -> Definition:
-    found: dict[str, Any] = {}
+    file_of: dict[str, Any] = {}
 
     def add(file: Any) -> None:
-        if file.name not in found:
+        if file.name not in file_of:
             for dependency in file.dependencies:
                 add(dependency)
-            found[file.name] = file
+            file_of[file.name] = file
 
     add(message.DESCRIPTOR.file)
     files = FileDescriptorSet()
-    for file in found.values():
+    for file in file_of.values():
         file.CopyToProto(files.file.add())
     return Definition(message.DESCRIPTOR.full_name, "protobuf", files.SerializeToString())
 
@@ -681,22 +681,22 @@ def test_the_meaning_of_labels() -> None:
     )
     problems = Problems()
     data = bytes(store.serialize_cdr(message, "vision_msgs/msg/LabelInfo"))
-    (found,) = Decoder(problems).frames(
+    (frame,) = Decoder(problems).frames(
         Message("/label_info", "vision_msgs/msg/LabelInfo", "cdr", 1, data, NOTHING)
     )
-    assert isinstance(found, LabelNames)
-    assert found.names == {0: "road", 7: "tree"}
-    assert found.header.stamp_ns == 3_000_000_004
+    assert isinstance(frame, LabelNames)
+    assert frame.names == {0: "road", 7: "tree"}
+    assert frame.header.stamp_ns == 3_000_000_004
     text = bytes(
         store.serialize_cdr(
             types["std_msgs/msg/String"](data="semantickitti"), "std_msgs/msg/String"
         )
     )
-    (found,) = Decoder(problems).frames(
+    (frame,) = Decoder(problems).frames(
         Message("/lidar/label_space", "std_msgs/msg/String", "cdr", 9, text, NOTHING)
     )
-    assert isinstance(found, LabelNames)
-    assert found.space == "semantickitti"
+    assert isinstance(frame, LabelNames)
+    assert frame.space == "semantickitti"
     assert (
         Decoder(problems).frames(
             Message("/chatter", "std_msgs/msg/String", "cdr", 9, text, NOTHING)

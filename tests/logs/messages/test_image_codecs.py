@@ -86,9 +86,9 @@ def test_png_keeps_grey_and_16_bits_and_gives_rgb() -> None:
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert decode_compressed(png(grey)).tolist() == grey.tolist()
     deep = (np.arange(12, dtype=np.uint16) * 5000).reshape(3, 4)
-    found = decode_compressed(png(deep))
-    assert found.dtype == np.uint16
-    assert found.tolist() == deep.tolist()
+    image = decode_compressed(png(deep))
+    assert image.dtype == np.uint16
+    assert image.tolist() == deep.tolist()
     blue_first = np.zeros((2, 2, 3), np.uint8)
     blue_first[..., 0] = 255
     assert decode_compressed(png(blue_first))[0, 0].tolist() == [0, 0, 255]
@@ -97,9 +97,9 @@ def test_png_keeps_grey_and_16_bits_and_gives_rgb() -> None:
 def test_jpeg() -> None:
     ok, data = cv2.imencode(".jpg", np.full((16, 24, 3), (10, 120, 240), np.uint8))
     assert ok
-    found = decode_compressed(bytes(data))
-    assert found.shape == (16, 24, 3)
-    assert np.abs(found[8, 8].astype(int) - [240, 120, 10]).max() < 6
+    image = decode_compressed(bytes(data))
+    assert image.shape == (16, 24, 3)
+    assert np.abs(image[8, 8].astype(int) - [240, 120, 10]).max() < 6
 
 
 def test_a_png_that_claims_gigapixels_is_refused_before_it_is_decoded() -> None:
@@ -134,16 +134,16 @@ def test_depth_units_and_holes() -> None:
 
 def test_compressed_depth_in_millimetres_and_as_inverse_depth() -> None:
     raw = np.array([[0, 1000, 2500]], np.uint16)
-    found = decode_compressed_depth(
+    depth_decoded = decode_compressed_depth(
         struct.pack("<iff", 0, 0, 0) + png(raw), "16UC1; compressedDepth png"
     )
-    np.testing.assert_allclose(found, [[0, 1.0, 2.5]])
+    np.testing.assert_allclose(depth_decoded, [[0, 1.0, 2.5]])
     quant_a, quant_b = 10100.0, -9.0
     depth = np.array([0.5, 2.0, 9.0])
     coded = np.array([[0, *np.round(quant_a / depth + quant_b)]], np.uint16)
     head = struct.pack("<iff", 0, quant_a, quant_b)
-    found = decode_compressed_depth(head + png(coded), "32FC1; compressedDepth png")
-    np.testing.assert_allclose(found[0], [0, *depth], rtol=2e-3)
+    depth_decoded = decode_compressed_depth(head + png(coded), "32FC1; compressedDepth png")
+    np.testing.assert_allclose(depth_decoded[0], [0, *depth], rtol=2e-3)
 
 
 def rvl(pixels: list[int], width: int, height: int) -> bytes:
@@ -158,18 +158,18 @@ def rvl(pixels: list[int], width: int, height: int) -> bytes:
             if not value:
                 return
 
-    at, previous = 0, 0
-    while at < len(pixels):
-        zeros = next((k for k, p in enumerate(pixels[at:]) if p), len(pixels) - at)
-        at += zeros
-        run = next((k for k, p in enumerate(pixels[at:]) if not p), len(pixels) - at)
+    start, previous = 0, 0
+    while start < len(pixels):
+        zeros = next((k for k, p in enumerate(pixels[start:]) if p), len(pixels) - start)
+        start += zeros
+        run = next((k for k, p in enumerate(pixels[start:]) if not p), len(pixels) - start)
         number(zeros)
         number(run)
-        for p in pixels[at : at + run]:
+        for p in pixels[start : start + run]:
             delta = p - previous
             previous = p
             number(2 * delta if delta >= 0 else -2 * delta - 1)
-        at += run
+        start += run
     nibbles += [0] * (-len(nibbles) % 8)
     words = [
         sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8]))
@@ -190,8 +190,8 @@ def test_compressed_depth_without_its_head() -> None:
     for format_ in ("16UC1; compressedDepth", "16UC1; compressedDepth rvl"):
         np.testing.assert_allclose(decode_compressed_depth(png(raw), format_), [[0, 1.0, 2.5]])
     # PNG behind the head, although the format has it otherwise
-    found = decode_compressed_depth(bytes(12) + png(raw), "16UC1; compressedDepth rvl")
-    np.testing.assert_allclose(found, [[0, 1.0, 2.5]])
+    depth = decode_compressed_depth(bytes(12) + png(raw), "16UC1; compressedDepth rvl")
+    np.testing.assert_allclose(depth, [[0, 1.0, 2.5]])
     with pytest.raises(UndecodableError, match="lacks the parameters"):
         decode_compressed_depth(png(raw), "32FC1; compressedDepth")
 

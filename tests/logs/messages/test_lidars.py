@@ -82,7 +82,7 @@ def test_two_lidars_see_one_room(recorder: Any, kind: str) -> None:
         seen.setdefault(cloud.header.topic, []).append(
             transforms.apply(cloud.session_T_base, cloud.points)
         )
-    assert {topic: len(found) for topic, found in seen.items()} == {
+    assert {topic: len(clouds) for topic, clouds in seen.items()} == {
         "/front/points": 8,
         "/rear/points": 8,
     }
@@ -323,9 +323,9 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
         assert Decoder(problems).frames(message) == []
         assert len(sentences(problems)) == 1
     count = struct.pack("<I", 5)
-    at = data.rindex(count, 0, len(data) - 5 * 19)
+    start = data.rindex(count, 0, len(data) - 5 * 19)
     problems = Problems()
-    claimed = data[:at] + struct.pack("<I", 2**32 - 1) + data[at + 4 :]
+    claimed = data[:start] + struct.pack("<I", 2**32 - 1) + data[start + 4 :]
     assert (
         Decoder(problems).frames(
             Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, claimed, definition)
@@ -349,8 +349,8 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
 
 def test_livox_points_of_signalling_nan_are_dropped_without_a_warning() -> None:
     data, definition = livox_message(PACKAGES[0], "ros1")
-    at = data.index(struct.pack("<fff", 2.0, 2.0, -1.0))
-    damaged = data[:at] + struct.pack("<I", 0x7F800001) + data[at + 4 :]
+    start = data.index(struct.pack("<fff", 2.0, 2.0, -1.0))
+    damaged = data[:start] + struct.pack("<I", 0x7F800001) + data[start + 4 :]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         [frame] = Decoder(Problems()).frames(

@@ -271,10 +271,10 @@ def test_positions_must_be_floating_point_fields_inside_the_point(fields: list[F
     ],
 )
 def test_units_and_origins_of_times(values: NDArray[np.generic], expected: list[int]) -> None:
-    found, _ = offsets_ns(values, STAMP)
-    assert found is not None
-    assert found.dtype == np.int64
-    np.testing.assert_allclose(found, expected, atol=20)
+    offset, _ = offsets_ns(values, STAMP)
+    assert offset is not None
+    assert offset.dtype == np.int64
+    np.testing.assert_allclose(offset, expected, atol=20)
 
 
 @pytest.mark.parametrize(
@@ -297,17 +297,17 @@ def test_the_unit_of_times_that_should_be_nanoseconds(count: int, last: int, uni
 
 def test_differences_to_the_stamp_may_have_lost_their_sign() -> None:
     offsets = np.arange(-40_000_000, 60_000_000, 1_000_000)
-    found, is_other = offsets_ns((offsets % 2**32).astype(np.uint32), STAMP)
+    decoded, is_other = offsets_ns((offsets % 2**32).astype(np.uint32), STAMP)
     assert not is_other
-    np.testing.assert_array_equal(found, offsets)
+    np.testing.assert_array_equal(decoded, offsets)
 
 
 def test_absolute_seconds_are_exact_to_their_precision() -> None:
     seconds = STAMP * 1e-9 + np.array([0.0, 0.02, 0.1])
-    found, _ = offsets_ns(seconds, STAMP)
-    assert found is not None
+    offset, _ = offsets_ns(seconds, STAMP)
+    assert offset is not None
     # a float64 of 1.7e9 s resolves 240 ns
-    np.testing.assert_allclose(found, [0, 20_000_000, 100_000_000], atol=500)
+    np.testing.assert_allclose(offset, [0, 20_000_000, 100_000_000], atol=500)
 
 
 @pytest.mark.parametrize(
@@ -333,18 +333,18 @@ def slow_points(
 ) -> list[tuple[float, ...]]:
     """The obvious loop."""
     order = ">" if layout.big_endian else "<"
-    found = []
+    points = []
     for v in range(layout.height):
         for u in range(layout.width):
-            at = v * layout.row_step + u * layout.point_step
+            start = v * layout.row_step + u * layout.point_step
             point = tuple(
-                struct.unpack_from(order + kinds[a][1], data, at + kinds[a][0])[0] for a in "xyz"
+                struct.unpack_from(order + kinds[a][1], data, start + kinds[a][0])[0] for a in "xyz"
             )
             if all(np.isfinite(np.float32(c)) for c in point) and any(
                 np.float32(c) != 0 for c in point
             ):
-                found.append(point)
-    return found
+                points.append(point)
+    return points
 
 
 @given(

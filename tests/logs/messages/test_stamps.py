@@ -60,9 +60,9 @@ def test_surroundings_that_move_while_the_poses_stand(
             street, np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)]
         ]
         street += rng.normal(0, 0.02, street.shape)
-        at = speed * (frozen[0] if k in frozen else k)
+        x = speed * (frozen[0] if k in frozen else k)
         cloud = (street - [speed * k, 0, 0]).astype(np.float32)
-        watch.add(cloud, yaw_transform(0.0, (at, 0, 0)), k * S)
+        watch.add(cloud, yaw_transform(0.0, (x, 0, 0)), k * S)
     assert (watch.shift > 0) == moves
     if watch.worst is not None:
         assert watch.worst.start_ns == frozen[0] * S

@@ -350,16 +350,16 @@ def test_kiss_icp_finds_a_known_motion_twice_the_same() -> None:
         )
         for k, pose in enumerate(truth)
     ]
-    found = []
+    runs = []
     for _ in range(2):
         made = LidarOdometry("/points", min_range=0.5, max_range=60.0)
         for frame in frames:
             made.take(frame)
         made.finish()
-        found.append(np.array([pose for _, pose in made.poses(lambda *_: None)]))
+        runs.append(np.array([pose for _, pose in made.poses(lambda *_: None)]))
         assert made.problems == []
-    np.testing.assert_array_equal(found[0], found[1])
-    np.testing.assert_allclose(found[0][:, :3, 3], np.array(truth)[:, :3, 3], atol=0.05)
+    np.testing.assert_array_equal(runs[0], runs[1])
+    np.testing.assert_allclose(runs[0][:, :3, 3], np.array(truth)[:, :3, 3], atol=0.05)
 
 
 # -- fixes

@@ -71,8 +71,8 @@ def degrees_of(east: float, north: float) -> tuple[float, float]:
 @given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-20, 20))
 def test_agrees_with_the_radii_of_curvature(east: float, north: float, up: float) -> None:
     latitude, longitude = degrees_of(east, north)
-    found = LocalFrame(LATITUDE, LONGITUDE, HEIGHT).position(latitude, longitude, HEIGHT + up)
-    np.testing.assert_allclose(found, [east, north, up], atol=5e-3)
+    position = LocalFrame(LATITUDE, LONGITUDE, HEIGHT).position(latitude, longitude, HEIGHT + up)
+    np.testing.assert_allclose(position, [east, north, up], atol=5e-3)
 
 
 # -- a drive on a circle, heading along its tangent
@@ -120,13 +120,13 @@ def drive(
     def base_T(frame: str, _: int) -> F64 | None:
         return mounts[frame] if frame in knows else None
 
-    found = []
+    stamped = []
     for frame in sorted(frames, key=lambda f: f.header.stamp_ns):
         source.take(frame)
-        found += list(source.poses(base_T))
+        stamped += list(source.poses(base_T))
     source.finish()
-    found += list(source.poses(base_T))
-    return {round((stamp - EPOCH) / S, 3): pose for stamp, pose in found}
+    stamped += list(source.poses(base_T))
+    return {round((stamp - EPOCH) / S, 3): pose for stamp, pose in stamped}
 
 
 def fixes(until: float = 20.0, step: float = 0.2) -> list[Frame]:
@@ -140,9 +140,9 @@ def samples(*, with_orientation: bool, until: float = 20.0, offset: float = 0.0)
     ]
 
 
-def check(found: dict[float, F64], *, position: float, angle: float) -> None:
+def check(poses: dict[float, F64], *, position: float, angle: float) -> None:
     start = (truth(0) @ ANTENNA)[:3, 3]
-    for seconds, pose in found.items():
+    for seconds, pose in poses.items():
         wanted = truth(seconds)
         wanted[:3, 3] -= start
         off = inverse(wanted) @ pose
@@ -154,9 +154,9 @@ def check(found: dict[float, F64], *, position: float, angle: float) -> None:
 
 def test_with_the_orientation_of_a_mounted_imu() -> None:
     source = NavSatPoses("/fix", 100)
-    found = drive(source, [*fixes(), *samples(with_orientation=True)])
-    assert len(found) == 100
-    check(found, position=0.01, angle=0.1)
+    poses = drive(source, [*fixes(), *samples(with_orientation=True)])
+    assert len(poses) == 100
+    check(poses, position=0.01, angle=0.1)
     assert source.problems == []
     content = source.to_json()
     assert (content["heading"], content["fixes"]) == ("imu", 100)
@@ -164,18 +164,18 @@ def test_with_the_orientation_of_a_mounted_imu() -> None:
 
 def test_with_the_course_and_an_accelerometer() -> None:
     source = NavSatPoses("/fix", 100)
-    found = drive(source, [*fixes(), *samples(with_orientation=False)])
-    assert len(found) == 100
+    poses = drive(source, [*fixes(), *samples(with_orientation=False)])
+    assert len(poses) == 100
     # the parabola at both ends of the drive has fixes on one side only
-    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.03, angle=1.0)
-    check(found, position=0.2, angle=6.0)
+    check({t: p for t, p in poses.items() if 1.5 < t < 18}, position=0.03, angle=1.0)
+    check(poses, position=0.2, angle=6.0)
     assert source.to_json()["heading"] == "course"
 
 
 def test_with_fixes_alone() -> None:
-    found = drive(NavSatPoses("/fix", 20), fixes(step=1.0), knows=("gps",))
-    assert len(found) == 20
-    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.05, angle=2.0)
+    poses = drive(NavSatPoses("/fix", 20), fixes(step=1.0), knows=("gps",))
+    assert len(poses) == 20
+    check({t: p for t, p in poses.items() if 1.5 < t < 18}, position=0.05, angle=2.0)
 
 
 def test_an_imu_of_unknown_mounting_is_not_believed() -> None:
@@ -211,10 +211,10 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
         for k in range(3)
     ]
     source = NavSatPoses("/fix", 103)
-    found = drive(source, [*frames, *missing, *samples(with_orientation=True)])
-    assert len(found) == 99
-    assert 2.0 not in found
-    check(found, position=0.01, angle=0.1)
+    poses = drive(source, [*frames, *missing, *samples(with_orientation=True)])
+    assert len(poses) == 99
+    assert 2.0 not in poses
+    check(poses, position=0.01, angle=0.1)
     assert sentences(source.problems) == [
         "/fix: 3 of 103 messages report a missing fix; they were left out.",
         "/fix: 1 of 103 messages are less certain than 5 m or out of order; they were left out.",
@@ -223,9 +223,9 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
 
 def test_a_gap_stays_a_gap() -> None:
     frames = [f for f in fixes() if not 5 * S < f.header.stamp_ns - EPOCH < 12 * S]
-    found = drive(NavSatPoses("/fix", len(frames)), [*frames, *samples(with_orientation=False)])
-    assert not [t for t in found if 5 < t < 11.9]
-    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.2, angle=6.0)
+    poses = drive(NavSatPoses("/fix", len(frames)), [*frames, *samples(with_orientation=False)])
+    assert not [t for t in poses if 5 < t < 11.9]
+    check({t: p for t, p in poses.items() if 1.5 < t < 18}, position=0.2, angle=6.0)
 
 
 def test_a_vehicle_that_never_moves_has_no_heading() -> None:
@@ -238,16 +238,16 @@ def test_a_vehicle_that_never_moves_has_no_heading() -> None:
 
 def test_the_heading_before_the_start_is_the_first_course() -> None:
     standing = [fix(0.2 * k - 10, np.zeros(3)) for k in range(50)]
-    found = drive(NavSatPoses("/fix", 150), [*standing, *fixes()], knows=())
-    assert len(found) == 150
-    assert abs(np.degrees(np.arctan2(found[-9.0][1, 0], found[-9.0][0, 0]))) < 15
+    poses = drive(NavSatPoses("/fix", 150), [*standing, *fixes()], knows=())
+    assert len(poses) == 150
+    assert abs(np.degrees(np.arctan2(poses[-9.0][1, 0], poses[-9.0][0, 0]))) < 15
 
 
 def test_driving_backwards_is_not_turning() -> None:
     there = [fix(0.2 * k, np.array([0.4 * k, 0, 0])) for k in range(50)]
     back = [fix(10 + 0.2 * k, np.array([19.6 - 0.4 * k, 0, 0])) for k in range(50)]
-    found = drive(NavSatPoses("/fix", 100), [*there, *back], knows=())
-    assert all(abs(np.arctan2(p[1, 0], p[0, 0])) < 0.1 for p in found.values())
+    poses = drive(NavSatPoses("/fix", 100), [*there, *back], knows=())
+    assert all(abs(np.arctan2(p[1, 0], p[0, 0])) < 0.1 for p in poses.values())
 
 
 def test_the_fixes_of_a_husky_agree_with_its_odometry(shared: Callable[[str], Path]) -> None:
@@ -287,11 +287,11 @@ def test_heights_between_known_ones_are_interpolated() -> None:
     for k in (0, 1, 7, 8, 9, 50, 99):
         frames[k] = without_altitude(frames[k])
     source = NavSatPoses("/fix", 100)
-    found = drive(source, frames, knows=("gps",))
-    assert len(found) == 100
+    poses = drive(source, frames, knows=("gps",))
+    assert len(poses) == 100
     assert sentences(source.problems) == []
     # heights count from the first one known, which is 0.2 m above the start: 0.5 m/s after 0.4 s
-    heights = {t: pose[2, 3] - known[t][2, 3] + 0.2 for t, pose in found.items()}
+    heights = {t: pose[2, 3] - known[t][2, 3] + 0.2 for t, pose in poses.items()}
     assert abs(heights[1.6]) < 1e-3
     assert abs(heights[10.0]) < 1e-3
     # before the first and after the last the nearest height serves
@@ -301,9 +301,9 @@ def test_heights_between_known_ones_are_interpolated() -> None:
 
 def test_positions_without_any_altitude_are_used_and_it_is_told() -> None:
     source = NavSatPoses("/fix", 100)
-    found = drive(source, [without_altitude(f) for f in climb(20.0)], knows=("gps",))
-    assert len(found) == 100
-    assert found[19.0][0, 3] - found[0.0][0, 3] == pytest.approx(95.0, abs=0.1)
+    poses = drive(source, [without_altitude(f) for f in climb(20.0)], knows=("gps",))
+    assert len(poses) == 100
+    assert poses[19.0][0, 3] - poses[0.0][0, 3] == pytest.approx(95.0, abs=0.1)
     [problem] = source.problems
     assert problem.assumed
     assert "/fix has an altitude: its heights are taken as constant" in problem.text
@@ -318,8 +318,8 @@ def test_a_first_height_that_comes_late_is_the_datum() -> None:
     for frame in frames[:40]:
         source.take(frame)
     assert list(source.poses(lambda _, __: np.eye(4)))
-    found = drive(source, frames[40:], knows=("gps",))
-    assert found[10.2][2, 3] - found[9.8][2, 3] == pytest.approx(0.1, abs=0.01)
+    poses = drive(source, frames[40:], knows=("gps",))
+    assert poses[10.2][2, 3] - poses[9.8][2, 3] == pytest.approx(0.1, abs=0.01)
     assert sentences(source.problems) == []
 
 

@@ -93,9 +93,9 @@ class TestTypesOfOneTopic:
             ("nav_msgs/msg/Odometry", "pose"),
             ("sensor_msgs/msg/PointCloud2", "lidar"),
         ]
-        found = inspect_log(path)
-        assert problem.text in found["problems"]  # type: ignore[operator]
-        assert found["poses"]["count"] == 62  # type: ignore[index]
+        inspection = inspect_log(path)
+        assert problem.text in inspection["problems"]  # type: ignore[operator]
+        assert inspection["poses"]["count"] == 62  # type: ignore[index]
 
     def test_the_user_chooses_the_other_type(self, recorder: Recorder) -> None:
         log = drive(recorder)
@@ -184,8 +184,8 @@ def test_two_encodings_of_one_topic_and_type_are_told_apart(tmp_path: Path) -> N
             writer.add_message(channels["protobuf"], time_ns, message.SerializeToString(), time_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     for choice, count in ((None, 62), ("/pose:json", 61)):
-        found = inspect_log(path, {} if choice is None else {"pose": choice})
-        assert found["poses"]["count"] == count  # type: ignore[index]
+        inspection = inspect_log(path, {} if choice is None else {"pose": choice})
+        assert inspection["poses"]["count"] == count  # type: ignore[index]
     assert any(
         "/pose has messages of 2 kinds" in p
         for p in inspect_log(path)["problems"]  # type: ignore[attr-defined]

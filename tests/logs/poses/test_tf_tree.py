@@ -33,15 +33,15 @@ def test_chain_and_its_inverse() -> None:
     tree = TransformTree()
     tree.add(edge("base_link", "mast", yaw_transform(np.pi / 2, (1.0, 0.0, 2.0))))
     tree.add(edge("/mast", "/lidar", yaw_transform(0.0, (3.0, 0.0, 0.0))))
-    found = tree.lookup("base_link", "lidar", 0)
-    assert found is not None
+    base_T_lidar = tree.lookup("base_link", "lidar", 0)
+    assert base_T_lidar is not None
     # 3 m ahead on a mast that is turned to the left is 3 m to the left of it
     np.testing.assert_allclose(
-        transforms.apply(found, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12
+        transforms.apply(base_T_lidar, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12
     )
     back = tree.lookup("/lidar", "base_link", 5)
     assert back is not None
-    np.testing.assert_allclose(back @ found, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(back @ base_T_lidar, np.eye(4), atol=1e-12)
 
 
 def test_same_frame_is_identity_and_strangers_are_unknown() -> None:
@@ -65,9 +65,9 @@ def test_moving_edges_are_interpolated_in_their_time_only() -> None:
     tree.add(drive("odom", "base_link", 1.0))
     tree.add(drive("odom", "base_link", 1.5))
     tree.add(edge("base_link", "lidar", yaw_transform(0.0, (0.0, 0.0, 2.0))))
-    found = tree.lookup("odom", "lidar", 1_200_000_000)
-    assert found is not None
-    np.testing.assert_allclose(found[:3, 3], [12.0, 0.0, 2.0])
+    odom_T_lidar = tree.lookup("odom", "lidar", 1_200_000_000)
+    assert odom_T_lidar is not None
+    np.testing.assert_allclose(odom_T_lidar[:3, 3], [12.0, 0.0, 2.0])
     assert tree.lookup("odom", "lidar", 2 * S) is None
 
 
@@ -76,9 +76,9 @@ def test_loops_end() -> None:
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a"), ("c", "c")):
         tree.add(edge(parent, child, yaw_transform(0.0, (1.0, 0.0, 0.0)), static=False))
     assert tree.lookup("a", "z", 0) is None
-    found = tree.lookup("a", "c", 0)
-    assert found is not None
-    assert found[0, 3] == pytest.approx(-1.0)  # the shorter way round
+    a_T_c = tree.lookup("a", "c", 0)
+    assert a_T_c is not None
+    assert a_T_c[0, 3] == pytest.approx(-1.0)  # the shorter way round
     assert tree.pose_edge("c") is not None
     assert tree.ignored == 1
 
@@ -89,11 +89,11 @@ def test_the_root_of_a_vehicle_is_above_static_edges_only() -> None:
     tree.add(edge("footprint", "base_link", yaw_transform(np.pi / 2, (1.0, 0.0, 0.5))))
     tree.add(edge("ground", "footprint", yaw_transform(0.0, (0.0, 0.0, 0.25))))
     tree.add(drive("base_link", "wheel", 0.0))
-    found = tree.root_above("/base_link")
-    assert found is not None
-    assert found[0] == "ground"
+    root = tree.root_above("/base_link")
+    assert root is not None
+    assert root[0] == "ground"
     # the ground is 1 m behind along x of the footprint, which is left of the vehicle
-    np.testing.assert_allclose(found[1][:3, 3], [0.0, 1.0, -0.75], atol=1e-12)
+    np.testing.assert_allclose(root[1][:3, 3], [0.0, 1.0, -0.75], atol=1e-12)
     tree.add(drive("odom", "ground", 0.0))
     assert tree.root_above("base_link") is None
     loop = TransformTree()
@@ -131,9 +131,9 @@ def test_dynamic_overrules_static_for_the_same_edge() -> None:
     tree.add(edge("a", "b", yaw_transform(0.0, (7.0, 0.0, 0.0))))
     tree.add(drive("a", "b", 1.0))
     tree.add(edge("a", "b", yaw_transform(0.0, (7.0, 0.0, 0.0))))
-    found = tree.lookup("a", "b", S)
-    assert found is not None
-    assert found[0, 3] == 10.0
+    a_T_b = tree.lookup("a", "b", S)
+    assert a_T_b is not None
+    assert a_T_b[0, 3] == 10.0
     assert tree.edges == [("a", "b", False)]
 
 

@@ -24,12 +24,12 @@ def track(*seconds: float, max_gap: float = 1.0) -> PoseTrack:
     return made
 
 
-def at(poses: PoseTrack, seconds: float) -> Array | None:
+def pose_at(poses: PoseTrack, seconds: float) -> Array | None:
     return poses.at(EPOCH + round(seconds * S))
 
 
 def test_interpolates_between_two_poses() -> None:
-    pose = at(track(0.0, 0.5, 1.0), 0.75)
+    pose = pose_at(track(0.0, 0.5, 1.0), 0.75)
     assert pose is not None
     np.testing.assert_allclose(pose, yaw_transform(0.075, (1.5, 0.0, 0.0)), atol=1e-9)
 
@@ -37,16 +37,16 @@ def test_interpolates_between_two_poses() -> None:
 def test_exact_stamps_give_the_recorded_pose_even_beside_a_gap() -> None:
     poses = track(0.0, 0.1, 9.0)
     for t in (0.1, 9.0):
-        pose = at(poses, t)
+        pose = pose_at(poses, t)
         assert pose is not None
         assert pose[0, 3] == pytest.approx(2.0 * t)
 
 
 def test_gap_and_outside_are_unknown() -> None:
     poses = track(*np.arange(0, 1.01, 0.1), 5.0, 5.1)
-    assert at(poses, 3.0) is None
-    assert at(poses, -0.11) is None
-    assert at(poses, 5.21) is None
+    assert pose_at(poses, 3.0) is None
+    assert pose_at(poses, -0.11) is None
+    assert pose_at(poses, 5.21) is None
 
 
 @pytest.mark.parametrize("seconds", [-0.09, 1.06])
@@ -55,7 +55,7 @@ def test_the_motion_goes_on_at_the_ends(seconds: float) -> None:
     circle = PoseTrack()
     for k in range(11):
         circle.append(EPOCH + k * S // 10, on_circle(0.1 * k))
-    pose = at(circle, seconds)
+    pose = pose_at(circle, seconds)
     assert pose is not None
     # between the poses its way is straight
     np.testing.assert_allclose(pose, on_circle(seconds), atol=1e-3)
@@ -68,7 +68,7 @@ def on_circle(seconds: float) -> Array:
 
 def test_a_pose_alone_behind_a_gap_is_not_continued() -> None:
     """Nothing tells how fast it moves there."""
-    pose = at(track(*np.arange(0, 1.01, 0.1), 5.0), 5.08)
+    pose = pose_at(track(*np.arange(0, 1.01, 0.1), 5.0), 5.08)
     assert pose is not None
     assert pose[0, 3] == pytest.approx(10.0)
 
@@ -96,7 +96,7 @@ def test_a_jump_at_an_end_is_not_continued(
             turned = yaw_transform(is_off * angle, (x, 0.0, 0.0))
             assert poses.append(EPOCH + round(k * period * S), turned)
         end = poses.poses[0 if is_first else -1]
-        beyond = at(poses, -0.08 if is_first else 50 * period + 0.08)
+        beyond = pose_at(poses, -0.08 if is_first else 50 * period + 0.08)
         assert beyond is not None
         moved = float(np.linalg.norm(beyond[:3, 3] - end[:3, 3]))
         assert moved == (pytest.approx(0.16, abs=0.06) if is_steady else 0.0)
@@ -105,20 +105,20 @@ def test_a_jump_at_an_end_is_not_continued(
 
 def test_one_pose_serves_a_tenth_of_a_second() -> None:
     poses = track(1.0)
-    assert at(poses, 1.09) is not None
-    assert at(poses, 0.91) is not None
-    assert at(poses, 1.11) is None
+    assert pose_at(poses, 1.09) is not None
+    assert pose_at(poses, 0.91) is not None
+    assert pose_at(poses, 1.11) is None
 
 
 def test_gap_is_judged_by_the_period_of_a_slow_stream() -> None:
     slow = track(*np.arange(0, 20, 0.5), 21.0)  # 2 Hz, then 1.5 s of nothing
     assert slow.gap_limit_ns() == 3 * S // 2
-    assert at(slow, 20.2) is not None
+    assert pose_at(slow, 20.2) is not None
     fast = track(*np.arange(0, 20, 0.1), 21.4)
     assert fast.gap_limit_ns() == S
-    assert at(fast, 20.5) is None
+    assert pose_at(fast, 20.5) is None
     very_slow = track(*np.arange(0, 100, 10))
-    assert at(very_slow, 5.0) is None  # nobody interpolates over ten seconds
+    assert pose_at(very_slow, 5.0) is None  # nobody interpolates over ten seconds
 
 
 def test_duplicates_jumps_back_and_nonsense_are_counted() -> None:
@@ -217,11 +217,11 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
 
     def is_steady(end: int, sign: int) -> bool:
         """Whether the motion at an end is as it was a step before."""
-        near = end - sign * max(100_000_000, abs(end - int(stamps[-2 if sign > 0 else 1])))
-        first, second, third = between(end), between(near), between(2 * near - end)
+        step_before = end - sign * max(100_000_000, abs(end - int(stamps[-2 if sign > 0 else 1])))
+        first, second, third = between(end), between(step_before), between(2 * step_before - end)
         if len(stamps) <= 2 or first is None or second is None or third is None:
             return False
-        seconds = abs(end - near) * 1e-9
+        seconds = abs(end - step_before) * 1e-9
         last, before = speeds(first, second, seconds), speeds(second, third, seconds)
         turn = Rotation.from_matrix(before[3:].reshape(3, 3))
         more = turn.inv() * Rotation.from_matrix(last[3:].reshape(3, 3))
@@ -232,16 +232,16 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
 
     for ms in wanted:
         t = ms * 1_000_000 + EPOCH
-        found = poses.at(t)
+        interpolated = poses.at(t)
         inside = int(np.clip(t, stamps[0], stamps[-1]))
         expected = between(inside) if abs(t - inside) <= 100_000_000 else None
         before = between(2 * inside - t)
         goes_on = t != inside and is_steady(inside, int(np.sign(t - inside)))
         if goes_on and expected is not None and before is not None:
             expected = expected @ np.linalg.inv(before) @ expected
-        assert (found is None) == (expected is None)
-        if found is not None and expected is not None:
-            np.testing.assert_allclose(found, expected, atol=1e-7)
+        assert (interpolated is None) == (expected is None)
+        if interpolated is not None and expected is not None:
+            np.testing.assert_allclose(interpolated, expected, atol=1e-7)
 
 
 def test_a_glitch_of_the_clock_is_taken_back() -> None:

@@ -44,24 +44,24 @@ def kitti(pose: F64) -> str:
 
 
 def test_tum_with_comments_and_blank_lines(tmp_path: Path) -> None:
-    found = read(
+    trajectory = read(
         tmp_path,
         f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n"
         f"{TUM_LINE.format(stamp='2')} # end\n",
     )
-    assert found.stamps_ns is not None
-    assert found.stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
-    np.testing.assert_allclose(found.poses[0][:3, 3], [1, 2, 3])
+    assert trajectory.stamps_ns is not None
+    assert trajectory.stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
+    np.testing.assert_allclose(trajectory.poses[0][:3, 3], [1, 2, 3])
     # a quaternion of z = 0.6, w = 0.8 turns x to (1 - 2 z^2, 2 z w)
-    np.testing.assert_allclose(found.poses[0][:3, 0], [0.28, 0.96, 0.0], atol=1e-12)
+    np.testing.assert_allclose(trajectory.poses[0][:3, 0], [0.28, 0.96, 0.0], atol=1e-12)
 
 
 def test_stamps_are_exact_where_floats_are_not(tmp_path: Path) -> None:
     text = "1700000000.123456789"
     assert round(float(text) * 1e9) != 1_700_000_000_123_456_789  # what the test is about
-    found = read(tmp_path, TUM_LINE.format(stamp=text))
-    assert found.stamps_ns is not None
-    assert found.stamps_ns.tolist() == [1_700_000_000_123_456_789]
+    trajectory = read(tmp_path, TUM_LINE.format(stamp=text))
+    assert trajectory.stamps_ns is not None
+    assert trajectory.stamps_ns.tolist() == [1_700_000_000_123_456_789]
 
 
 @given(st.integers(-(10**18), 3 * 10**18))

@@ -236,10 +236,10 @@ def test_labels_come_from_the_nearest_label_image() -> None:
     ms = 1_000_000
     for k in range(5):
         clouds.labels.take(label_frame(k * 100 * ms, k))
-    found = clouds.points(depth_frame(204 * ms), 0.0, 80.0)
-    assert isinstance(found, RangePoints)
-    assert found[1] is not None
-    assert set(found[1].tolist()) == {2}
+    cloud = clouds.points(depth_frame(204 * ms), 0.0, 80.0)
+    assert isinstance(cloud, RangePoints)
+    assert cloud[1] is not None
+    assert set(cloud[1].tolist()) == {2}
     unlabelled = clouds.points(depth_frame(250 * ms), 0.0, 80.0)
     assert isinstance(unlabelled, RangePoints)
     assert unlabelled[1] is None
@@ -250,19 +250,19 @@ def test_each_pixel_gets_its_own_label() -> None:
     clouds.calibrations["/d/camera_info"] = camera()
     ids = np.arange(48, dtype=np.uint8).reshape(6, 8)
     clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), ids, "mono8"))
-    found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert isinstance(found, RangePoints)
-    assert found[1] is not None
-    assert found[1].tolist() == ids[::2, ::2].ravel().tolist()
+    cloud = clouds.points(depth_frame(), 0.0, 80.0)
+    assert isinstance(cloud, RangePoints)
+    assert cloud[1] is not None
+    assert cloud[1].tolist() == ids[::2, ::2].ravel().tolist()
 
 
 def test_label_images_of_another_size_are_left_out_with_a_note() -> None:
     clouds = DepthClouds(ROLES)
     clouds.calibrations["/d/camera_info"] = camera()
     clouds.labels.take(label_frame(0, 1, (3, 4)))
-    found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert isinstance(found, RangePoints)
-    assert found[1] is None
+    cloud = clouds.points(depth_frame(), 0.0, 80.0)
+    assert isinstance(cloud, RangePoints)
+    assert cloud[1] is None
     assert "--topic label_image=TOPIC" in sentences(clouds.labels.problems)[0]
 
 
@@ -272,10 +272,10 @@ def test_colours_of_a_label_image_are_packed() -> None:
     colours = np.zeros((6, 8, 3), np.uint8)
     colours[..., 0], colours[..., 1], colours[..., 2] = 128, 64, 32
     clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), colours, "rgb8"))
-    found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert isinstance(found, RangePoints)
-    assert found[1] is not None
-    assert set(found[1].tolist()) == {128 * 65536 + 64 * 256 + 32}
+    cloud = clouds.points(depth_frame(), 0.0, 80.0)
+    assert isinstance(cloud, RangePoints)
+    assert cloud[1] is not None
+    assert set(cloud[1].tolist()) == {128 * 65536 + 64 * 256 + 32}
     assert clouds.labels.coloured == {"/d/label"}
 
 
@@ -290,15 +290,15 @@ def test_reasons() -> None:
     millimetres = ImageFrame(
         Header("/d/depth", 0, 0, ""), np.full((6, 8), 1500, np.uint16), "mono16"
     )
-    found = clouds.points(millimetres, 0.0, 80.0)
-    assert isinstance(found, RangePoints)
-    np.testing.assert_allclose(found[0][:, 2], 1.5)
+    cloud = clouds.points(millimetres, 0.0, 80.0)
+    assert isinstance(cloud, RangePoints)
+    np.testing.assert_allclose(cloud[0][:, 2], 1.5)
 
 
 def test_label_ids_survive_being_taken_for_millimetres() -> None:
     ids = np.arange(65535, dtype=np.float32).reshape(1, -1)
-    found = label_ids(
+    ids_again = label_ids(
         DepthFrame(Header("/l", 0, 0, ""), (ids * np.float32(0.001)).astype(np.float32))
     )
-    assert found is not None
-    np.testing.assert_array_equal(found, ids.astype(np.uint32))
+    assert ids_again is not None
+    np.testing.assert_array_equal(ids_again, ids.astype(np.uint32))

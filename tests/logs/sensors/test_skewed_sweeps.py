@@ -49,15 +49,15 @@ def skewed(start: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
         ],
         1,
     )
-    found = np.empty((len(turn), 3))
+    points = np.empty((len(turn), 3))
     for k, o in enumerate(offset):
         room_T_lidar = pose(start + o * 1e-9) @ BASE_T_LIDAR
         ray = room_T_lidar[:3, :3] @ rays[k]
         origin = room_T_lidar[:3, 3]
         with np.errstate(divide="ignore"):
             distance = np.min(np.where(ray > 0, HALF - origin, -HALF - origin) / ray)
-        found[k] = rays[k] * distance
-    return found, offset, ring
+        points[k] = rays[k] * distance
+    return points, offset, ring
 
 
 def off_the_walls(points: Array) -> float:
@@ -117,12 +117,12 @@ def record(
 def walls(path: Path) -> tuple[list[float], Any]:
     """How far the points of each sweep are off the walls."""
     session = open_session([path])
-    found = []
+    errors = []
     for cloud in session.clouds():
         assert cloud.session_T_base is not None
-        found.append(off_the_walls(transforms.apply(cloud.session_T_base, cloud.points)))
-    assert len(found) == SWEEPS, sentences(session.problems)
-    return found, session
+        errors.append(off_the_walls(transforms.apply(cloud.session_T_base, cloud.points)))
+    assert len(errors) == SWEEPS, sentences(session.problems)
+    return errors, session
 
 
 @pytest.mark.parametrize("log_kind", ["ros2", "ros1", "protobuf"])
@@ -166,9 +166,9 @@ def test_absolute_integers(name: str, stamp_at: float) -> None:
     """PointCloud2 has no 64-bit integers, so the function is called directly."""
     _, offset, _ = skewed(0.0)
     stamp = EPOCH + round(stamp_at * PERIOD_NS)
-    found, _ = offsets_ns(((EPOCH + offset) // unit).astype(np.uint64), stamp)
-    assert found is not None
-    np.testing.assert_allclose(found, EPOCH + offset - stamp, atol=unit)
+    decoded, _ = offsets_ns(((EPOCH + offset) // unit).astype(np.uint64), stamp)
+    assert decoded is not None
+    np.testing.assert_allclose(decoded, EPOCH + offset - stamp, atol=unit)
 
 
 def test_points_that_are_all_far_from_their_stamp_are_named(recorder: Any) -> None:
@@ -225,12 +225,12 @@ GARBAGE: dict[str, tuple[str, str, Encode]] = {
 @pytest.mark.parametrize("name", GARBAGE)
 def test_times_that_are_none_leave_the_sweep_as_it_was(recorder: Any, name: str) -> None:
     field, kind, encode = GARBAGE[name]
-    found, session = walls(record(recorder(), field, encode, kind))
+    errors, session = walls(record(recorder(), field, encode, kind))
     measured = [
         off_the_walls(transforms.apply(pose(0.1 * k) @ BASE_T_LIDAR, skewed(0.1 * k)[0]))
         for k in range(SWEEPS)
     ]
-    np.testing.assert_allclose(found, measured, atol=1e-3)
+    np.testing.assert_allclose(errors, measured, atol=1e-3)
     assert lost(session.problems) == []
     assert session.to_json()["sweeps_deskewed"] == 0
     assert any(

@@ -106,18 +106,18 @@ def test_a_slanted_plane_through_each_lens(model: str) -> None:
     how = rectification(left, right, (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
     matcher = StereoMatcher(how, min_range=0.3, max_range=20.0)
     picture, truth = drawn(left, np.eye(4), 1)
-    found = matcher.points(picture, drawn(right, LEFT_T_RIGHT, 2)[0])
-    assert len(found.points) > 0.6 * HEIGHT * WIDTH
-    error = errors(found.points)
-    normalised = errors(found.points) / found.sigma
+    cloud = matcher.points(picture, drawn(right, LEFT_T_RIGHT, 2)[0])
+    assert len(cloud.points) > 0.6 * HEIGHT * WIDTH
+    error = errors(cloud.points)
+    normalised = errors(cloud.points) / cloud.sigma
     assert abs(np.median(error)) < 0.01
     assert np.median(np.abs(error)) < 0.05
     # sigma is meant to hold, neither hopeful nor timid
     assert 0.75 < 1.4826 * np.median(np.abs(normalised - np.median(normalised))) < 1.25
     assert np.mean(np.abs(normalised) < 3) > 0.98
     # the pixel of a point is where it was seen: its ray, half a pixel to all sides
-    seen = truth[found.pixels] / np.linalg.norm(truth[found.pixels], axis=1)[:, None]
-    ray = found.points / np.linalg.norm(found.points, axis=1)[:, None]
+    seen = truth[cloud.pixels] / np.linalg.norm(truth[cloud.pixels], axis=1)[:, None]
+    ray = cloud.points / np.linalg.norm(cloud.points, axis=1)[:, None]
     assert np.percentile(np.arccos(np.clip(np.sum(seen * ray, axis=1), -1, 1)), 99) < 0.8 / 200
 
 
@@ -133,8 +133,8 @@ def test_a_wrong_calibration_would_be_seen(wrong: str) -> None:
     if wrong == "rotation":
         right_T_left = right_T_left @ exp_se3(np.zeros(3), np.array([0.01, 0.01, 0.0]))
     how = rectification(left, right, (HEIGHT, WIDTH), right_T_left, rectified=False)
-    found = StereoMatcher(how, min_range=0.3, max_range=20.0).points(*pictures)
-    assert len(found.points) == 0 or np.mean(np.abs(errors(found.points)) < 0.05) < 0.5
+    cloud = StereoMatcher(how, min_range=0.3, max_range=20.0).points(*pictures)
+    assert len(cloud.points) == 0 or np.mean(np.abs(errors(cloud.points)) < 0.05) < 0.5
 
 
 def test_shrunk_pictures_and_thinned_points() -> None:
@@ -180,7 +180,7 @@ def _unturned(
 
 
 @pytest.mark.parametrize(
-    ("width", "near", "far", "expected"),
+    ("width", "nearest", "far", "expected"),
     [
         (640, 1.0, 20.0, (1, 48)),  # 40 px at 1 m, 2 px at 20 m, a pixel more at both ends
         (640, 0.01, 20.0, (1, 64)),  # 4000 px at 1 cm: no more than a tenth of the width
@@ -188,9 +188,9 @@ def _unturned(
     ],
 )
 def test_disparities_follow_from_the_ranges(
-    width: int, near: float, far: float, expected: tuple[int, int]
+    width: int, nearest: float, far: float, expected: tuple[int, int]
 ) -> None:
-    matcher = StereoMatcher(_unturned(480, width), min_range=near, max_range=far, stride=1)
+    matcher = StereoMatcher(_unturned(480, width), min_range=nearest, max_range=far, stride=1)
     assert (matcher.least, matcher.count) == expected
 
 
@@ -206,31 +206,31 @@ def test_a_step_by_hand_in_rectified_pictures(shift: float) -> None:
     right = np.empty_like(left)
     for rows, disparity in ((slice(0, 120), 20 + int(shift)), (slice(120, 240), 8 + int(shift))):
         right[rows] = noise[rows, 100 + disparity : 420 + disparity]
-    found = StereoMatcher(how, min_range=0.5, max_range=20.0).points(left, right)
+    cloud = StereoMatcher(how, min_range=0.5, max_range=20.0).points(left, right)
     for (first, last), depth in (((4, 110), 2.0), ((130, 236), 5.0)):
-        inside = (found.pixels // 320 >= first) & (found.pixels // 320 < last)
+        inside = (cloud.pixels // 320 >= first) & (cloud.pixels // 320 < last)
         assert inside.sum() > 0.7 * 106 * 320
-        assert np.mean(np.abs(found.points[inside, 2] - depth) < 0.03 * depth) > 0.98
-    column = found.pixels % 320
-    row = found.pixels // 320
+        assert np.mean(np.abs(cloud.points[inside, 2] - depth) < 0.03 * depth) > 0.98
+    column = cloud.pixels % 320
+    row = cloud.pixels // 320
     np.testing.assert_allclose(
-        found.points[:, 0], (column - 160 - shift) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4
+        cloud.points[:, 0], (column - 160 - shift) / 400 * cloud.points[:, 2], rtol=1e-4, atol=1e-4
     )
     np.testing.assert_allclose(
-        found.points[:, 1], (row - 120) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4
+        cloud.points[:, 1], (row - 120) / 400 * cloud.points[:, 2], rtol=1e-4, atol=1e-4
     )
 
 
 def test_sigma_by_hand() -> None:
     """f b = 40 px m: at 2 m the disparity is 20, a fifth of a pixel is 4 / 40 / 5 = 2 cm."""
     noise = np.random.default_rng(3).integers(0, 255, (240, 700)).astype(np.uint8)
-    found = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0, noise=0.2).points(
+    cloud = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0, noise=0.2).points(
         noise[:, 100:420], noise[:, 120:440]
     )
-    middle = np.argmin(np.abs(found.pixels - (120 * 320 + 160)))
-    assert found.sigma[middle] == pytest.approx(0.02, rel=0.1)
-    ray = np.linalg.norm(found.points, axis=1) / found.points[:, 2]
-    np.testing.assert_allclose(found.sigma / ray, found.sigma[middle], rtol=0.15)
+    middle = np.argmin(np.abs(cloud.pixels - (120 * 320 + 160)))
+    assert cloud.sigma[middle] == pytest.approx(0.02, rel=0.1)
+    ray = np.linalg.norm(cloud.points, axis=1) / cloud.points[:, 2]
+    np.testing.assert_allclose(cloud.sigma / ray, cloud.sigma[middle], rtol=0.15)
 
 
 def test_pictures_that_cannot_be_matched_give_nothing() -> None:
@@ -260,15 +260,15 @@ def test_any_number_of_threads_gives_the_same() -> None:
     how = rectification(left, right, (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
     pictures = drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
     before = cv2.getNumThreads()
-    found = []
+    clouds = []
     try:
         for threads in (1, 2, 3):
             cv2.setNumThreads(threads)
-            found.append(StereoMatcher(how, min_range=0.3, max_range=20.0).points(*pictures))
+            clouds.append(StereoMatcher(how, min_range=0.3, max_range=20.0).points(*pictures))
     finally:
         cv2.setNumThreads(before)
-    for other in found[1:]:
-        for a, b in zip(found[0], other, strict=True):
+    for other in clouds[1:]:
+        for a, b in zip(clouds[0], other, strict=True):
             np.testing.assert_array_equal(a, b)
 
 
@@ -308,10 +308,10 @@ def test_recorded_rotations_and_projections_serve_where_tf_is_missing() -> None:
     )
     how = rectification(left, right, (HEIGHT, WIDTH), None, rectified=False)
     assert how.baseline == pytest.approx(np.linalg.norm(LEFT_T_RIGHT[:3, 3]))
-    found = StereoMatcher(how, min_range=0.3, max_range=20.0).points(
+    cloud = StereoMatcher(how, min_range=0.3, max_range=20.0).points(
         drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
     )
-    assert np.mean(np.abs(errors(found.points)) < 3 * found.sigma) > 0.97
+    assert np.mean(np.abs(errors(cloud.points)) < 3 * cloud.sigma) > 0.97
 
 
 def test_wide_lenses_keep_their_field_of_view_within_limits() -> None:

@@ -75,10 +75,10 @@ def test_partners_are_the_nearest_within_half_a_period() -> None:
     assert stereo.tolerance_ns == 20 * MS
     reasons = [stereo.points(picture(LEFT, k * 40 * MS), 0.3, 20.0) for k in range(4)]
     assert reasons[2] == NoCloud.NO_PARTNER
-    for found in (reasons[0], reasons[1], reasons[3]):
-        assert isinstance(found, RangePoints)
+    for cloud in (reasons[0], reasons[1], reasons[3]):
+        assert isinstance(cloud, RangePoints)
         # 100 px * 0.2 m / 10 px
-        np.testing.assert_allclose(np.median(found.points[:, 2]), 2.0, atol=0.02)
+        np.testing.assert_allclose(np.median(cloud.points[:, 2]), 2.0, atol=0.02)
 
 
 def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
@@ -103,11 +103,11 @@ def test_labels_belong_to_the_left_pixels() -> None:
     ids = np.arange(120 * 160, dtype=np.uint16).reshape(120, 160)
     stereo._labels.take(ImageFrame(Header("/ids", 0, 0, ""), ids, "mono16"))
     stereo.take_right(picture(RIGHT, 0, 10))
-    found = stereo.points(picture(LEFT, 0), 0.3, 20.0)
-    assert isinstance(found, RangePoints)
-    assert found.label is not None
-    column = 100 * found.points[:, 0] / found.points[:, 2] + 80
-    np.testing.assert_allclose(found.label % 160, column, atol=1e-3)
+    cloud = stereo.points(picture(LEFT, 0), 0.3, 20.0)
+    assert isinstance(cloud, RangePoints)
+    assert cloud.label is not None
+    column = 100 * cloud.points[:, 0] / cloud.points[:, 2] + 80
+    np.testing.assert_allclose(cloud.label % 160, column, atol=1e-3)
 
 
 def test_memory_is_bounded_when_no_left_picture_comes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,9 +155,9 @@ def test_transforms_serve_where_the_infos_have_no_baseline() -> None:
         )
         stereo = clouds(roles, right_T_left, [info("/l"), info("/r")])
         stereo.take_right(picture(right, 0, 10))
-        found = stereo.points(picture(left, 0), 0.3, 20.0)
-        assert isinstance(found, RangePoints)
-        assert np.median(found.points[:, 2]) == pytest.approx(2.0, abs=0.02)
+        cloud = stereo.points(picture(left, 0), 0.3, 20.0)
+        assert isinstance(cloud, RangePoints)
+        assert np.median(cloud.points[:, 2]) == pytest.approx(2.0, abs=0.02)
 
 
 def test_colour_and_sixteen_bits_become_the_same_grey() -> None:
@@ -180,7 +180,7 @@ def planes(
     Unit normal, root mean square (m) and share of the points within ``width``.
     """
     rng = np.random.default_rng(0)
-    found = []
+    fitted = []
     rest = np.asarray(points, float)
     for _ in range(count):
         some = rest[rng.permutation(len(rest))[:3000]]
@@ -195,16 +195,16 @@ def planes(
                 best, most = ((normal, a), inliers) if inliers > most else (best, most)
         normal, centre = best
         for _ in range(3):
-            near = rest[np.abs((rest - centre) @ normal) < width]
-            centre = near.mean(axis=0)
-            normal = np.linalg.svd((near - centre).T @ (near - centre))[2][-1]
+            close_points = rest[np.abs((rest - centre) @ normal) < width]
+            centre = close_points.mean(axis=0)
+            normal = np.linalg.svd((close_points - centre).T @ (close_points - centre))[2][-1]
         distance = (rest - centre) @ normal
         inside = np.abs(distance) < width
-        found.append(
+        fitted.append(
             (normal, float(np.sqrt(np.mean(distance[inside] ** 2))), inside.sum() / len(points))
         )
         rest = rest[~inside]
-    return found
+    return fitted
 
 
 def in_world(cloud: PosedCloud) -> F64:
@@ -235,10 +235,10 @@ def is_the_room(points: F64) -> bool:
 @pytest.fixture(scope="module")
 def room(shared: Callable[[str], Path]) -> list[PosedCloud]:
     session = open_session([shared(REAL)], SessionOptions(max_range=10.0))
-    found = list(session.clouds())
+    clouds = list(session.clouds())
     assert lost(session.problems) == []
     session.close()
-    return found
+    return clouds
 
 
 def test_the_floor_is_level_and_walls_are_planes_in_each_frame(room: list[PosedCloud]) -> None:
@@ -263,8 +263,10 @@ def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
     cloud = room[0]
     points = in_world(cloud)
     normal, _, _ = planes(points, 1)[0]
-    near = points[np.abs(points[:, 2]) < 0.3]
-    centre = np.median(near[np.abs(near @ normal - np.median(near @ normal)) < 0.05], axis=0)
+    low_points = points[np.abs(points[:, 2]) < 0.3]
+    centre = np.median(
+        low_points[np.abs(low_points @ normal - np.median(low_points @ normal)) < 0.05], axis=0
+    )
     assert cloud.sigma is not None
     assert cloud.session_T_base is not None
     rays = points - apply(cloud.session_T_base, cloud.origin[None])

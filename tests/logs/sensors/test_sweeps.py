@@ -91,8 +91,8 @@ def test_range_limits_and_labels_go_together() -> None:
     points = np.array([[0.2, 0, 0], [1, 0, 0], [50, 0, 0], [90, 0, 0]], np.float32)
     label = np.array([1, 2, 3, 4], np.uint32)
     frame = LidarFrame(Header("/l", STAMP, STAMP, "lidar"), points, label=label)
-    found, labels, _ = sweep_in_base(frame, np.eye(4), None, min_range=0.5, max_range=80.0)
-    assert found[:, 0].tolist() == [1, 50]
+    kept, labels, _ = sweep_in_base(frame, np.eye(4), None, min_range=0.5, max_range=80.0)
+    assert kept[:, 0].tolist() == [1, 50]
     assert labels is not None
     assert labels.tolist() == [2, 3]
 

@@ -89,7 +89,7 @@ def test_mountings_that_cannot_be_right_are_named(
     check = _check(log.write())
     texts = [finding.text for stream in check.streams for finding in stream.findings]
     assert check.fits == (not text)
-    assert [text in found for found in texts] == [True] * bool(text)
+    assert [text in problem for problem in texts] == [True] * bool(text)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0], ids=["metres", "millimetres"])

@@ -33,14 +33,14 @@ Part = Callable[..., Path]
 
 @pytest.fixture
 def part(recorder: Callable[..., Any]) -> Part:
-    """Writes a short log; ``mount``: base_T_lidar in /tf_static at ``at`` seconds, or none."""
+    """Writes a short log; ``mount``: base_T_lidar in /tf_static at ``seconds``, or none."""
 
     def write(
-        name: str, mount: Array | None, *, at: float = 0.0, parent: str = "base_link"
+        name: str, mount: Array | None, *, seconds: float = 0.0, parent: str = "base_link"
     ) -> Path:
         log = recorder("ros2", name)
         if mount is not None:
-            log.transform(parent, "lidar", mount, EPOCH + round(at * S))
+            log.transform(parent, "lidar", mount, EPOCH + round(seconds * S))
         rng = np.random.default_rng(0)
         points = np.zeros(500, XYZ)
         points["x"], points["y"] = rng.uniform(2, 9, (2, 500))
@@ -98,7 +98,7 @@ def test_logs_that_do_not_agree_lend_nothing(part: Part) -> None:
 
 
 def test_a_mounting_that_is_recorded_late_holds_from_the_start(part: Part) -> None:
-    origin, problems = first_cloud(part("late", MOUNT, at=2.9))
+    origin, problems = first_cloud(part("late", MOUNT, seconds=2.9))
     np.testing.assert_allclose(origin, [1, 0, 2])
     assert problems == []
 

@@ -127,9 +127,9 @@ def test_a_truncated_drive(shared: Callable[[str], Path], tmp_path: Path) -> Non
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole[: len(whole) * 6 // 10])
     log = open_log(path)
-    found = Counter(m.topic for m in log.messages())
-    assert sum(found.values()) >= 60
-    assert {s.topic: s.count for s in log.streams} == found
+    count_of_topic = Counter(m.topic for m in log.messages())
+    assert sum(count_of_topic.values()) >= 60
+    assert {s.topic: s.count for s in log.streams} == count_of_topic
     assert len(log.problems) == 1
     assert "cut.mcap" in sentences(log.problems)[0]
 

@@ -87,9 +87,9 @@ def test_a_good_log_has_figures_and_no_problem(recorder: Recorder) -> None:
     assert session.to_json()["stamps"]["/odom"]["median"] == 0.0  # type: ignore[index]
     assert stamp_problems(session) == []
     assert forward(clouds) == pytest.approx([0.1 * k for k in range(60)], abs=1e-6)
-    found = inspect_log(path)
-    assert found["problems"] == []
-    assert set(found["stamps"]) == {"/odom", "/points"}  # type: ignore[call-overload]
+    inspection = inspect_log(path)
+    assert inspection["problems"] == []
+    assert set(inspection["stamps"]) == {"/odom", "/points"}  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(
@@ -352,8 +352,8 @@ def test_edges_of_tf_are_compared_each_by_itself(recorder: Recorder) -> None:
         log.cloud("/points", time_ns, "base_link", np.ones(3, POINT))
         log.transform("odom", "base_link", yaw_transform(0.0, (0.1 * k, 0, 0)), time_ns, "/tf")
         log.transform("map", "odom", np.eye(4), time_ns + S, "/tf")
-        at, topic, message = log.events.pop()
-        log.add(topic, message, at - S)
+        log_time_ns, topic, message = log.events.pop()
+        log.add(topic, message, log_time_ns - S)
     session, clouds = fused(log.write())
     assert len(clouds) == 60
     assert stamp_problems(session) == []
@@ -371,9 +371,9 @@ def test_memory_is_bounded_and_the_figures_stay() -> None:
         offsets.take(PoseSample(header, "", np.eye(4)))
         steady = Header("/y", EPOCH + k * MS, EPOCH + k * MS, "")
         offsets.take(PoseSample(steady, "", np.eye(4)))
-    found = offsets.of("/x")
-    assert found is not None
-    assert (found.messages, found.least, found.greatest) == (100_000, 1.0, 3.0)
+    offset = offsets.of("/x")
+    assert offset is not None
+    assert (offset.messages, offset.least, offset.greatest) == (100_000, 1.0, 3.0)
     relative = offsets.relative("/x", "/y")
     assert 1000 < len(relative) <= 2048
     assert relative[0] == pytest.approx(1.0)
@@ -401,6 +401,6 @@ def test_json_without_stamps_takes_log_times_and_a_note(tmp_path: Path) -> None:
             data = json.dumps({"frame_id": "map", "pose": pose}).encode()
             writer.add_message(channel, EPOCH + k * S, data, EPOCH + k * S)
         writer.finish()  # type: ignore[no-untyped-call]
-    found = inspect_log(path)
-    assert found["poses"]["count"] == 3  # type: ignore[index]
-    assert any("all 3 header stamps are 0 or missing" in p for p in found["problems"])  # type: ignore[attr-defined]
+    inspection = inspect_log(path)
+    assert inspection["poses"]["count"] == 3  # type: ignore[index]
+    assert any("all 3 header stamps are 0 or missing" in p for p in inspection["problems"])  # type: ignore[attr-defined]

@@ -77,18 +77,18 @@ def test_exact_coordinates_give_the_pose(town: Any) -> None:
     camera_T_world = inverse(world_T_base @ picture.base_T_camera)
     known = np.isfinite(grid.points).all(1)
     points = apply(world_T_base, grid.points[known]).astype(np.float32)
-    found = torch.from_numpy(points)
+    coordinates = torch.from_numpy(points)
     pixel = grid.pixel[known]
     # all cells are inliers of the truth, and few of a pose that is half a metre off
-    right = float(soft_inliers(found, pixel, grid.intrinsics, camera_T_world))
+    right = float(soft_inliers(coordinates, pixel, grid.intrinsics, camera_T_world))
     off = camera_T_world.copy()
     off[0, 3] += 0.5
     assert right > 0.97 * known.sum()
-    assert float(soft_inliers(found, pixel, grid.intrinsics, off)) < 0.7 * right
+    assert float(soft_inliers(coordinates, pixel, grid.intrinsics, off)) < 0.7 * right
     poses = hypotheses(points, pixel, grid.intrinsics, np.random.default_rng(0))
     assert len(poses) > 8
     assert np.median([pose_loss(p, camera_T_world) for p in poses]) < 1.0
-    loss = chosen_loss(found, pixel, grid.intrinsics, camera_T_world, poses)
+    loss = chosen_loss(coordinates, pixel, grid.intrinsics, camera_T_world, poses)
     assert float(loss) < 0.5
 
 

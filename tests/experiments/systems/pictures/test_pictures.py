@@ -42,8 +42,8 @@ def spots() -> NDArray[np.uint8]:
     image = np.full((200, 300), 128.0)
     y, x = np.mgrid[:200, :300]
     for _ in range(150):
-        at = rng.uniform([10, 10], [290, 190])
-        inside = np.hypot((x - at[0]) / rng.uniform(0.6, 1), y - at[1]) < rng.uniform(3, 9)
+        centre = rng.uniform([10, 10], [290, 190])
+        inside = np.hypot((x - centre[0]) / rng.uniform(0.6, 1), y - centre[1]) < rng.uniform(3, 9)
         image[inside] = rng.uniform(0, 255)
     return np.repeat(gaussian_filter(image, 1.0).astype(np.uint8)[:, :, None], 3, axis=2)
 
@@ -73,8 +73,15 @@ def test_the_points_have_the_levels_that_the_library_gives(spots: NDArray[np.uin
         again = keypoint(p.pt[0], p.pt[1], p.size)
         # the library's size has a part of a layer more or less
         level = 3 * (octave - 256 * (octave > 127)) + layer
-        mine = again.octave & 255
-        assert abs(3 * (mine - 256 * (mine > 127)) + ((again.octave >> 8) & 255) - level) <= 1
+        octave_again = again.octave & 255
+        assert (
+            abs(
+                3 * (octave_again - 256 * (octave_again > 127))
+                + ((again.octave >> 8) & 255)
+                - level
+            )
+            <= 1
+        )
 
 
 def test_root_sift_has_the_hellinger_distance() -> None:
@@ -87,9 +94,9 @@ def test_root_sift_has_the_hellinger_distance() -> None:
 
 def test_dense_features_lie_on_a_grid_at_four_scales() -> None:
     image = np.random.default_rng(0).integers(0, 255, (100, 140, 3)).astype(np.uint8)
-    found = dense_sift(image, 20)
-    assert len(found.xy) == 4 * len(np.unique(found.xy, axis=0)) == 4 * 3 * 5
-    assert set(np.diff(np.unique(found.xy[:, 0])).tolist()) == {20.0}
+    features = dense_sift(image, 20)
+    assert len(features.xy) == 4 * len(np.unique(features.xy, axis=0)) == 4 * 3 * 5
+    assert set(np.diff(np.unique(features.xy[:, 0])).tolist()) == {20.0}
 
 
 def test_matches_are_mutual_and_pass_the_ratio() -> None:
@@ -148,12 +155,12 @@ def test_a_pose_from_points_by_hand() -> None:
     pixels = shifted @ intrinsics.T
     xy = (pixels[:, :2] / pixels[:, 2:]).astype(np.float32)
     xy[:20] += rng.uniform(20, 60, (20, 2))
-    found = pose_of_points(xy, points, intrinsics)
-    assert found is not None
-    assert found.inliers == 40
+    pose = pose_of_points(xy, points, intrinsics)
+    assert pose is not None
+    assert pose.inliers == 40
     wanted = np.eye(4)
     wanted[0, 3] = 0.5
-    np.testing.assert_allclose(found.camera_T_points, wanted, atol=1e-3)
+    np.testing.assert_allclose(pose.camera_T_points, wanted, atol=1e-3)
     assert pose_of_points(xy[:30], points[:30], intrinsics) is None  # 10 inliers
 
 

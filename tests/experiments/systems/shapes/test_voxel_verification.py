@@ -37,10 +37,10 @@ def test_the_share_is_the_papers_ratio(database: Any, point_drive: Any) -> None:
         pose = np.eye(4)
         pose[:3, 3] = 0.3 * np.array(shift)
         verifier._complete_tiles(np.array([[0.0, *pose[:3, 3]]]), 100.0)
-        (found,) = verifier._tau(centres, label, np.array([[0.0, *pose[:3, 3]]]))
+        (share,) = verifier._tau(centres, label, np.array([[0.0, *pose[:3, 3]]]))
         wanted, _ = tau((ijk, label), database.blocks, 0.3, pose, 3.0)
         # two observed voxels may be equally close
-        assert found == pytest.approx(wanted, abs=0.03)
+        assert share == pytest.approx(wanted, abs=0.03)
     assert verifier._tau(centres, label, np.zeros((1, 4)))[0] > 0.9
 
 
