@@ -122,7 +122,7 @@ class LossyDisk:
         """What may be on the disk after a crash now."""
         self._observe()
         nodes = list(self._all_nodes())
-        found: list[Tree] = []
+        states: list[Tree] = []
         for kept in _subsets(sum(len(n.pending) for n in nodes)):
             position = 0
             chosen = {}
@@ -130,8 +130,8 @@ class LossyDisk:
                 chosen[node] = kept[position : position + len(node.pending)]
                 position += len(node.pending)
             tree = _tree(self._top, chosen)
-            if tree not in found:
-                found.append(tree)
+            if tree not in states:
+                states.append(tree)
                 yield tree
 
     def _wrapped(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
@@ -223,11 +223,11 @@ def _subsets(count: int) -> Iterator[tuple[bool, ...]]:
 
 
 def _tree(folder: _Folder, chosen: dict[Any, tuple[bool, ...]]) -> Tree:
-    found: Tree = {}
+    tree: Tree = {}
     for name, node in folder.after(list(chosen[folder])).items():
         kept = chosen[node]
-        found[name] = _tree(node, chosen) if isinstance(node, _Folder) else node.after(list(kept))
-    return found
+        tree[name] = _tree(node, chosen) if isinstance(node, _Folder) else node.after(list(kept))
+    return tree
 
 
 def read_tree(folder: Path) -> Tree:

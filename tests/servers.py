@@ -131,13 +131,13 @@ class Bucket:
         return bytes(self._client.get_object(Bucket="drives", Key=name)["Body"].read())
 
     def names(self) -> list[str]:
-        found = self._client.list_objects_v2(Bucket="drives").get("Contents", [])
-        return sorted(entry["Key"] for entry in found)
+        entries = self._client.list_objects_v2(Bucket="drives").get("Contents", [])
+        return sorted(entry["Key"] for entry in entries)
 
     def unfinished(self) -> list[str]:
         """Names of uploads that were begun and neither completed nor given up."""
-        found = self._client.list_multipart_uploads(Bucket="drives").get("Uploads", [])
-        return [entry["Key"] for entry in found]
+        entries = self._client.list_multipart_uploads(Bucket="drives").get("Uploads", [])
+        return [entry["Key"] for entry in entries]
 
 
 @contextmanager

@@ -37,8 +37,8 @@ def _blocks(language: str) -> Iterator[tuple[Path, str]]:
     """Code blocks of a language in all pages."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        for found in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
-            yield page, found
+        for block in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            yield page, block
 
 
 def _shell_lines() -> Iterator[tuple[Path, list[str]]]:
@@ -60,9 +60,9 @@ INLINE = [
 
 
 def _command(name: str) -> click.Command:
-    found: click.Command | None = program.get_command(click.Context(program), name)
-    assert found is not None, f"semloc has no command {name}"
-    return found
+    command: click.Command | None = program.get_command(click.Context(program), name)
+    assert command is not None, f"semloc has no command {name}"
+    return command
 
 
 # -- commands
@@ -247,9 +247,9 @@ def test_rooms_of_the_architecture_are_the_rooms() -> None:
     rows = re.findall(r"^\| (`[^|]+) \|", table, re.MULTILINE)
     named = {room for row in rows for room in re.findall(r"`([a-z_]+)`", row)}
     package = ROOT / "semloc_logs"
-    found = {path.parent.name for path in package.glob("*/__init__.py")}
-    found |= {path.stem for path in package.glob("*.py")} - {"__init__"}
-    assert named == found | {"schemas"}
+    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
+    rooms |= {path.stem for path in package.glob("*.py")} - {"__init__"}
+    assert named == rooms | {"schemas"}
 
 
 @pytest.mark.parametrize("name", ["ARCHITECTURE.md", "CONTRIBUTING.md", "README.md"])

@@ -23,11 +23,11 @@ def test_defaults_file_environment_assignments_in_this_order(file: Path) -> None
         "PATH": "/bin",
         "SEMLOC_HOME": "x",
     }
-    found = load(file, {"fusion.miss": "0.45", "labels.source": "uniform"}, environment)
-    f = found.fusion
+    loaded = load(file, {"fusion.miss": "0.45", "labels.source": "uniform"}, environment)
+    f = loaded.fusion
     assert (f.clamp, f.voxel_size, f.hit, f.miss) == ((-2.0, 3.5), 0.2, 0.8, 0.45)
-    assert found.query.frames == 3
-    assert found.labels.source == "uniform"
+    assert loaded.query.frames == 3
+    assert loaded.labels.source == "uniform"
     assert load() == Settings()
 
 

@@ -85,26 +85,26 @@ def test_up_is_found_in_any_axes(turn: F64) -> None:
     poses = straight()
     poses[:, :3, 3] = poses[:, :3, 3] @ turn.T
     poses[:, :3, :3] = turn
-    found = find(street() @ turn.T, Z, poses)
-    assert degrees_between(found.up, turn @ Z) < 1
-    assert not found.is_assumed
-    assert found.source is UpSource.MAP
-    assert found.margin is not None
-    assert found.margin > 0.1
+    gravity = find(street() @ turn.T, Z, poses)
+    assert degrees_between(gravity.up, turn @ Z) < 1
+    assert not gravity.is_assumed
+    assert gravity.source is UpSource.MAP
+    assert gravity.margin is not None
+    assert gravity.margin > 0.1
     # a direction against the convention is a note, an expected one needs none
     off = degrees_between(turn @ Z, Z)
-    assert bool(found.problems) == (off > 40)
-    assert found.off_convention == pytest.approx(off, abs=1)
+    assert bool(gravity.problems) == (off > 40)
+    assert gravity.off_convention == pytest.approx(off, abs=1)
 
 
 @pytest.mark.parametrize("convention", [X, -X, Y, -Y, Z, -Z])
 def test_the_convention_decides_where_the_evidence_is_equal(convention: F64) -> None:
-    found = find(box(), convention)
-    assert degrees_between(found.up, convention) < 1
-    assert found.source is UpSource.CONVENTION
-    assert found.margin is not None
-    assert abs(found.margin) < 0.05
-    (problem,) = found.problems
+    gravity = find(box(), convention)
+    assert degrees_between(gravity.up, convention) < 1
+    assert gravity.source is UpSource.CONVENTION
+    assert gravity.margin is not None
+    assert abs(gravity.margin) < 0.05
+    (problem,) = gravity.problems
     assert problem.assumed
     assert "by convention, and" in problem.text
     assert "fits about as well" in problem.text
@@ -115,24 +115,24 @@ def test_a_box_is_level_in_the_plane_of_motion() -> None:
     poses = straight(9)
     poses[5:, 0, 3] = poses[4, 0, 3]
     poses[5:, 1, 3] = 2.0 * np.arange(1, 5)
-    found = find(box(), X, poses)
-    assert degrees_between(found.up, Z) < 1 or degrees_between(found.up, -Z) < 1
+    gravity = find(box(), X, poses)
+    assert degrees_between(gravity.up, Z) < 1 or degrees_between(gravity.up, -Z) < 1
 
 
 def test_an_imu_that_agrees_says_nothing() -> None:
     tilted = Rotation.from_rotvec(np.radians(5) * X).as_matrix() @ Z
-    found = find(street(), -Z, imu=tilted)
-    assert degrees_between(found.up, Z) < 1
-    assert found.source is UpSource.IMU
-    assert found.off_imu == pytest.approx(5, abs=1)
-    assert not found.problems
+    gravity = find(street(), -Z, imu=tilted)
+    assert degrees_between(gravity.up, Z) < 1
+    assert gravity.source is UpSource.IMU
+    assert gravity.off_imu == pytest.approx(5, abs=1)
+    assert not gravity.problems
 
 
 def test_an_imu_whose_mounting_is_turned_is_named_and_the_map_is_level() -> None:
     tilted = Rotation.from_rotvec(np.radians(20) * X).as_matrix() @ Z
-    found = find(street(), Z, imu=tilted)
-    assert degrees_between(found.up, Z) < 1
-    [problem] = found.problems
+    gravity = find(street(), Z, imu=tilted)
+    assert degrees_between(gravity.up, Z) < 1
+    [problem] = gravity.problems
     assert not problem.is_reported
     assert "up of /imu is 20 degrees off the ground and the walls of the map" in problem.text
 
@@ -140,28 +140,28 @@ def test_an_imu_whose_mounting_is_turned_is_named_and_the_map_is_level() -> None
 @pytest.mark.parametrize("imu", [-Z, X, Y])
 def test_an_imu_that_contradicts_the_map_is_not_believed(imu: F64) -> None:
     """Of another axis convention, or with the sign of free fall."""
-    found = find(street(), Z, imu=imu)
-    assert degrees_between(found.up, Z) < 1
-    assert found.source is UpSource.MAP
-    assert found.is_assumed
-    (problem,) = found.problems
+    gravity = find(street(), Z, imu=imu)
+    assert degrees_between(gravity.up, Z) < 1
+    assert gravity.source is UpSource.MAP
+    assert gravity.is_assumed
+    (problem,) = gravity.problems
     assert problem.topic == "/imu"
     assert problem.text.startswith("drive.mcap: /imu contradicts the map: its up is ")
     assert "logs.up" in problem.text
 
 
 def test_an_imu_is_believed_where_the_map_does_not_tell() -> None:
-    found = find(box(), Z, imu=-Y)
-    assert degrees_between(found.up, -Y) < 1
-    assert (found.source, found.problems) == (UpSource.IMU, ())
+    gravity = find(box(), Z, imu=-Y)
+    assert degrees_between(gravity.up, -Y) < 1
+    assert (gravity.source, gravity.problems) == (UpSource.IMU, ())
 
 
 def test_without_surfaces_the_convention_is_assumed_and_an_imu_is_not() -> None:
     points = np.random.default_rng(0).normal(size=(500, 3)) * 10
-    found = find(points, Z)
-    assert np.array_equal(found.up, Z)
-    assert (found.source, found.margin, found.is_assumed) == (UpSource.CONVENTION, None, True)
-    assert "+z of frame 'odom' is taken as up by convention" in found.problems[0].text
+    gravity = find(points, Z)
+    assert np.array_equal(gravity.up, Z)
+    assert (gravity.source, gravity.margin, gravity.is_assumed) == (UpSource.CONVENTION, None, True)
+    assert "+z of frame 'odom' is taken as up by convention" in gravity.problems[0].text
     with_imu = find(points, Z, imu=Y)
     assert np.array_equal(with_imu.up, Y)
     assert (with_imu.source, with_imu.problems) == (UpSource.IMU, ())
@@ -179,10 +179,10 @@ def test_a_ceiling_that_shows_as_much_as_the_floor_is_doubtful(share: float, how
         plane(np.array([9.0, -9.0, -2.0]), 18 * Y, 4 * Z),
     ]
     floor = slab[1][slab[1][:, 0] < -9 + 18 * share]
-    found = find(np.concatenate([slab[0], floor, *walls]), Z)
-    assert degrees_between(found.up, Z) < 1
-    assert found.is_assumed
-    assert f"+z of frame 'odom' is taken as up by convention, {how}" in found.problems[0].text
+    gravity = find(np.concatenate([slab[0], floor, *walls]), Z)
+    assert degrees_between(gravity.up, Z) < 1
+    assert gravity.is_assumed
+    assert f"+z of frame 'odom' is taken as up by convention, {how}" in gravity.problems[0].text
 
 
 @pytest.mark.parametrize(("height", "is_flipped"), [(1.2, True), (2.8, False)])
@@ -197,9 +197,9 @@ def test_the_floor_is_nearer_than_the_ceiling(height: float, is_flipped: bool) -
         plane(np.array([-9.0, -9.0, -height]), 18 * X, 4 * Z),
         plane(np.array([-9.0, -9.0, -height]), 18 * Y, 4 * Z),
     ]
-    found = find(np.concatenate([floor, ceiling, *walls]), -Z)
-    assert degrees_between(found.up, Z if is_flipped else -Z) < 1
-    assert found.is_assumed
+    gravity = find(np.concatenate([floor, ceiling, *walls]), -Z)
+    assert degrees_between(gravity.up, Z if is_flipped else -Z) < 1
+    assert gravity.is_assumed
 
 
 @pytest.mark.parametrize("imu", [None, Z])
@@ -211,17 +211,17 @@ def test_a_wall_that_fills_the_view_is_not_the_ground(imu: F64 | None) -> None:
     points = np.concatenate([wall, wall + 0.003, floor, *sides])
     poses = straight()
     poses[:, :2, 3] = poses[:, 1::-1, 3]  # along the wall
-    found = find(points, Z, poses, imu)
-    assert degrees_between(found.up, Z) < 1
-    assert found.is_assumed
-    assert "fits better" in found.problems[0].text
+    gravity = find(points, Z, poses, imu)
+    assert degrees_between(gravity.up, Z) < 1
+    assert gravity.is_assumed
+    assert "fits better" in gravity.problems[0].text
 
 
 def test_a_direction_that_is_given_overrules_all_and_is_refined() -> None:
     places = flat_places(street().astype(np.float32), np.zeros(3), 0.2)
-    near = Rotation.from_rotvec(np.radians(8) * Y).as_matrix() @ (3 * Z)
-    found = given_gravity(near, places.normals, places.weights)
-    assert degrees_between(found.up, Z) < 1
+    given = Rotation.from_rotvec(np.radians(8) * Y).as_matrix() @ (3 * Z)
+    gravity = given_gravity(given, places.normals, places.weights)
+    assert degrees_between(gravity.up, Z) < 1
     down = given_gravity(-Z, places.normals, places.weights)
     assert degrees_between(down.up, -Z) < 1
     assert (down.source, down.problems) == (UpSource.SETTING, ())
@@ -326,9 +326,9 @@ def test_the_map_is_level_however_the_frames_are(
     """
     base_T_sensor = rotated(mounting, 0.3, 0.2, 0.1)
     clouds = collected(tmp_path, rotated(frames, 5e5, 6e6, 100), base_T_sensor, posed)
-    found = levelled(clouds)
-    assert not found.gravity.is_assumed
-    for map_T_base in found.map_T_base:
+    levelling = levelled(clouds)
+    assert not levelling.gravity.is_assumed
+    for map_T_base in levelling.map_T_base:
         points = apply(map_T_base @ base_T_sensor, street())
         sensor = apply(map_T_base, base_T_sensor[:3, 3][None])[0]
         ground = points[: len(points) // 2]
@@ -339,10 +339,10 @@ def test_the_map_is_level_however_the_frames_are(
 def test_the_same_frames_give_the_same_map_wherever_the_convention_points(tmp_path: Path) -> None:
     """A level drive is not touched by the search over the sphere."""
     clouds = collected(tmp_path, np.eye(4), np.eye(4), posed=True)
-    found = levelled(clouds)
-    assert degrees_between(found.session_T_map[:3, 2], Z) < 0.1
-    assert found.gravity.problems == ()
-    assert set(found.gravity.to_json()) == {
+    levelling = levelled(clouds)
+    assert degrees_between(levelling.session_T_map[:3, 2], Z) < 0.1
+    assert levelling.gravity.problems == ()
+    assert set(levelling.gravity.to_json()) == {
         "source",
         "up",
         "margin",
@@ -362,7 +362,7 @@ def test_names_of_frames_tell_the_convention(frame: str, up: F64, tmp_path: Path
     points = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
     header = Header("/points", 1, 1, "lidar")
     clouds.add(PosedCloud(header, points, np.zeros(3, np.float32), np.eye(4)), np.arange(300))
-    found = levelled(clouds, session_frame=frame)
-    assert np.array_equal(found.gravity.up, up)
-    assert np.allclose(found.session_T_map[:3, 2], up)
+    levelling = levelled(clouds, session_frame=frame)
+    assert np.array_equal(levelling.gravity.up, up)
+    assert np.allclose(levelling.session_T_map[:3, 2], up)
     assert np.allclose(levelled(clouds, frame, up="-y").gravity.up, -Y)

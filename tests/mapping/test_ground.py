@@ -17,17 +17,19 @@ def hill(xy: F64) -> F64:
     return np.asarray(2.0 * np.sin(xy[:, 0] / 15) + 0.05 * xy[:, 1])
 
 
-def sweep(rng: np.random.Generator, at: tuple[float, float], scale: float = 1.0) -> tuple[F64, F64]:
+def sweep(
+    rng: np.random.Generator, position: tuple[float, float], scale: float = 1.0
+) -> tuple[F64, F64]:
     """Ground within 20 m, a bridge 5 m above it, a hole of 3 m where nothing is seen."""
     r = 20 * np.sqrt(rng.random(9000))
     a = rng.uniform(0, 2 * np.pi, 9000)
-    xy = np.c_[r * np.cos(a), r * np.sin(a)] + at
+    xy = np.c_[r * np.cos(a), r * np.sin(a)] + position
     xy = xy[np.hypot(*(xy - [4.0, 4.0]).T) > 3]
     deck = rng.uniform((-30, 8), (60, 11), (3000, 2))
     points = np.concatenate(
         [np.c_[xy, hill(xy) + rng.normal(0, 0.01, len(xy))], np.c_[deck, hill(deck) + 5]]
     )
-    eye = np.array([*at, hill(np.array([at]))[0] + 1.8])
+    eye = np.array([*position, hill(np.array([position]))[0] + 1.8])
     return points * scale, eye * scale
 
 
@@ -63,15 +65,15 @@ def test_of_two_levels_the_one_that_is_seen_more() -> None:
 def test_the_order_of_keyframes_does_not_matter() -> None:
     rng = np.random.default_rng(2)
     sweeps = [sweep(rng, (float(x), 0.0)) for x in (0, 7, 14)]
-    found = []
+    grounds = []
     for order in ((0, 1, 2), (2, 0, 1)):
         mapper = GroundMapper(1.0)
         for k in order:
             points, eye = sweeps[k]
             mapper.add(ground_surface(points, eye), eye)
-        found.append(mapper.finish())
-    assert (found[0].ij == found[1].ij).all()
-    np.testing.assert_allclose(found[0].z, found[1].z, atol=1e-12)
+        grounds.append(mapper.finish())
+    assert (grounds[0].ij == grounds[1].ij).all()
+    np.testing.assert_allclose(grounds[0].z, grounds[1].z, atol=1e-12)
 
 
 def test_written_and_read_again(tmp_path: Path) -> None:

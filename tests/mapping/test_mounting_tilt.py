@@ -28,8 +28,8 @@ def turned(degrees: float, imu: F64 = Z, convention: F64 = Z, *, fronts: float =
     wall = degrees if math.isnan(fronts) else fronts
     normals = np.array([*ROAD @ about(X, degrees).T, *FRONTS @ about(X, wall).T])
     up = about(X, degrees) @ Z
-    found = turn_about_way(up, imu, convention, X, normals, np.ones(len(normals)))
-    return math.degrees(found)
+    angle = turn_about_way(up, imu, convention, X, normals, np.ones(len(normals)))
+    return math.degrees(angle)
 
 
 @pytest.mark.parametrize("degrees", [5.0, -8.0, 30.0])

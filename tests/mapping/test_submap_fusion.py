@@ -30,9 +30,9 @@ ORIGINS = [np.array([0.1, 0.2, 0.3], np.float32)] * N
 @settings(max_examples=25, deadline=None)
 def test_submaps_fused_in_passing_are_those_fused_one_by_one(length: float, overlap: float) -> None:
     ranges = submap_ranges(np.arange(N, dtype=float), length, overlap)
-    found = list(fuse_ranges(KEYFRAMES, ranges, POSES, ORIGINS, FUSION))
-    assert len(found) == len(ranges)
-    for (first, last), blocks in zip(ranges, found, strict=True):
+    submaps = list(fuse_ranges(KEYFRAMES, ranges, POSES, ORIGINS, FUSION))
+    assert len(submaps) == len(ranges)
+    for (first, last), blocks in zip(ranges, submaps, strict=True):
         alone = Fuser(FUSION)
         for i in range(first, last):
             alone.add(KEYFRAMES[i].points, KEYFRAMES[i].label, ORIGINS[i], None, POSES[i])

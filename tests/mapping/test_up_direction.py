@@ -57,9 +57,9 @@ def test_a_known_tilt_is_found(tilt: float, what: str) -> None:
     """The prior is wrong by the tilt."""
     normals = scene(1, floor=4000 if "floor" in what else 0, walls=6000 if "walls" in what else 0)
     turn = Rotation.from_rotvec(np.radians(tilt) * np.array([0.6, -0.8, 0.0])).as_matrix()
-    found = find_up(normals @ turn.T, np.ones(len(normals)), UP)
-    assert np.linalg.norm(found) == pytest.approx(1)
-    assert degrees_between(found, turn @ UP) < 0.1
+    up = find_up(normals @ turn.T, np.ones(len(normals)), UP)
+    assert np.linalg.norm(up) == pytest.approx(1)
+    assert degrees_between(up, turn @ UP) < 0.1
 
 
 def test_a_slope_does_not_pass_for_the_floor() -> None:

@@ -49,14 +49,14 @@ def test_a_covariance_that_rounding_made_negative_has_no_spread() -> None:
 )
 def test_planes_lines_and_clouds(extent: tuple[float, float, float], name: str) -> None:
     points = RNG.uniform(-1, 1, (200, 3)) * extent
-    found = shape(points, neighbours=200)
-    shares = {n: float(getattr(found, n)[0]) for n in ("linear", "planar", "scattered")}
+    shapes = shape(points, neighbours=200)
+    shares = {n: float(getattr(shapes, n)[0]) for n in ("linear", "planar", "scattered")}
     assert max(shares, key=lambda n: shares[n]) == name
     assert sum(shares.values()) == pytest.approx(1.0)
     if name == "planar":
-        np.testing.assert_allclose(np.abs(found.normal[0]), [0, 0, 1], atol=1e-6)
+        np.testing.assert_allclose(np.abs(shapes.normal[0]), [0, 0, 1], atol=1e-6)
     if name == "linear":
-        np.testing.assert_allclose(np.abs(found.direction[0]), [1, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(np.abs(shapes.direction[0]), [1, 0, 0], atol=1e-6)
 
 
 def test_far_from_the_origin_the_shape_is_the_same() -> None:

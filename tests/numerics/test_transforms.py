@@ -109,7 +109,7 @@ def test_interpolation_of_stamps_since_1970() -> None:
             yaw_transform(0.4, (1.0, 4.0, 0.0)),
         ]
     )
-    at = start + np.array(
+    queried = start + np.array(
         [
             -5,
             0,
@@ -121,13 +121,15 @@ def test_interpolation_of_stamps_since_1970() -> None:
             9_000_000_000,
         ]
     )
-    found = interpolate(stamps, poses, at)
-    np.testing.assert_allclose(found[:, 0, 3], [0, 0, 0.25, 0.250000001, 1, 1, 1, 1], atol=1e-12)
-    np.testing.assert_allclose(found[:, 1, 3], [0, 0, 0, 0, 0, 2, 4, 4], atol=1e-12)
-    yaw = np.arctan2(found[:, 1, 0], found[:, 0, 0])
+    interpolated = interpolate(stamps, poses, queried)
+    np.testing.assert_allclose(
+        interpolated[:, 0, 3], [0, 0, 0.25, 0.250000001, 1, 1, 1, 1], atol=1e-12
+    )
+    np.testing.assert_allclose(interpolated[:, 1, 3], [0, 0, 0, 0, 0, 2, 4, 4], atol=1e-12)
+    yaw = np.arctan2(interpolated[:, 1, 0], interpolated[:, 0, 0])
     np.testing.assert_allclose(yaw, [0, 0, 0.1, 0.1000000004, 0.4, 0.4, 0.4, 0.4], atol=1e-12)
     np.testing.assert_allclose(
-        interpolate(stamps[:1], poses[1:2], at), np.repeat(poses[1:2], len(at), 0)
+        interpolate(stamps[:1], poses[1:2], queried), np.repeat(poses[1:2], len(queried), 0)
     )
 
 

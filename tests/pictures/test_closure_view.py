@@ -95,7 +95,7 @@ def test_the_best_of_each_pair_of_sessions_and_the_best_rejected_without_a_closu
 
 
 @pytest.mark.parametrize(
-    ("at", "expected"),
+    ("seconds", "expected"),
     [
         (1003.2, (1003.0, True)),
         (3.2, (1003.0, True)),
@@ -104,9 +104,9 @@ def test_the_best_of_each_pair_of_sessions_and_the_best_rejected_without_a_closu
     ],
 )
 def test_the_query_nearest_to_a_time(
-    work: Workspace, at: float, expected: tuple[float, bool]
+    work: Workspace, seconds: float, expected: tuple[float, bool]
 ) -> None:
-    assert stamps(choose(work, Wanted(session="a", at=at))) == [("a", *expected)]
+    assert stamps(choose(work, Wanted(session="a", at=seconds))) == [("a", *expected)]
 
 
 def test_a_closure_by_its_number(work: Workspace) -> None:
@@ -183,10 +183,10 @@ def test_a_sheet_shows_the_walls_apart_and_together(tmp_path: Path) -> None:
 
 
 def test_what_json_says() -> None:
-    said = drawn(view(0.0, accepted=False))
-    assert said["accepted"] is False
-    assert said["reason"] == "too little"
-    assert said["matches"] == [{"bits": 5, "target_position_m": [1.0, 2.0, 0.0]}]
+    content = drawn(view(0.0, accepted=False))
+    assert content["accepted"] is False
+    assert content["reason"] == "too little"
+    assert content["matches"] == [{"bits": 5, "target_position_m": [1.0, 2.0, 0.0]}]
 
 
 def test_the_command_refuses_what_cannot_be_shown(tmp_path: Path) -> None:
@@ -199,8 +199,8 @@ def test_the_command_refuses_what_cannot_be_shown(tmp_path: Path) -> None:
         return done.exit_code, done.output
 
     assert show("--closure", 1, "--at", 3)[0] == 2
-    code, said = show()
+    code, output = show()
     assert code == 1
-    assert "semloc fuse" in said
+    assert "semloc fuse" in output
     (tmp_path / "o.png").write_bytes(b"")
     assert "--overwrite" in show()[1]

@@ -113,10 +113,10 @@ def annotated(
 @pytest.fixture(scope="module")
 def rows(labelled: Workspace) -> list[dict[str, Any]]:
     """The closures, read without our reader: each drive is localised in those before it."""
-    found: list[dict[str, Any]] = pq.read_table(labelled.closures).to_pylist()
-    pairs = {(row["query_session"], row["target_session"]) for row in found}
+    closures: list[dict[str, Any]] = pq.read_table(labelled.closures).to_pylist()
+    pairs = {(row["query_session"], row["target_session"]) for row in closures}
     assert pairs == {("tuesday", "monday"), ("wednesday", "monday"), ("wednesday", "tuesday")}
-    return found
+    return closures
 
 
 def ends(row: Any) -> tuple[str, int, str, int]:
@@ -184,9 +184,9 @@ def test_every_closure_of_the_log_is_there_as_query_and_as_target(
     }
     as_query = {"monday": {False}, "tuesday": {True, False}, "wednesday": {True}}
     assert {end[0] == name for end in expected} == as_query[name]
-    found = topics["/semloc/loop_closures"]
-    assert sorted(ends(read.message) for read in found) == sorted(expected)
-    for read in found:
+    messages = topics["/semloc/loop_closures"]
+    assert sorted(ends(read.message) for read in messages) == sorted(expected)
+    for read in messages:
         row = expected[ends(read.message)]
         for key in (
             "t_x",
@@ -226,9 +226,9 @@ def test_poses_are_the_true_ones_in_the_frame_of_the_target(
         for row in rows
         if row["query_session"] == name
     )
-    found = topics.get("/semloc/pose", [])
-    assert sorted(header(read.message) for read in found) == wanted
-    for read in found:
+    messages = topics.get("/semloc/pose", [])
+    assert sorted(header(read.message) for read in messages) == wanted
+    for read in messages:
         stamp, frame_id = header(read.message)
         assert read.log_time_ns == stamp + RECEIVED_NS
         target = drives[frame_id.removeprefix("semloc/")]
@@ -284,8 +284,8 @@ def test_frames_of_other_sessions_are_placed(annotated: Any, drives: Any) -> Non
     for other in NAMES:
         truth = drives[name].session_T_world @ np.linalg.inv(drives[other].session_T_world)
         place = (drives[other].session_T_world @ world)[:3, 3]  # on the road, not far off
-        found = placed[f"semloc/{other}"][:3, :3] @ place + placed[f"semloc/{other}"][:3, 3]
-        np.testing.assert_allclose(found, truth[:3, :3] @ place + truth[:3, 3], atol=0.15)
+        measured = placed[f"semloc/{other}"][:3, :3] @ place + placed[f"semloc/{other}"][:3, 3]
+        np.testing.assert_allclose(measured, truth[:3, :3] @ place + truth[:3, 3], atol=0.15)
 
 
 def test_the_vehicle_moves_in_logs_without_transforms(annotated: Any, drives: Any) -> None:
@@ -415,8 +415,8 @@ def test_poses_in_the_common_frame(
         q = edge.transform.rotation
         odom_T_common = transform(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
         truth = drives["monday"].session_T_world @ drives["monday"].world_T_base(stamp)
-        found = odom_T_common @ pose_of(message.pose.pose)
-        np.testing.assert_allclose(found[:3, 3], truth[:3, 3], atol=0.01)
+        common_T_base = odom_T_common @ pose_of(message.pose.pose)
+        np.testing.assert_allclose(common_T_base[:3, 3], truth[:3, 3], atol=0.01)
 
 
 def test_common_poses_need_an_optimised_workspace(

@@ -202,11 +202,11 @@ def test_weights_without_their_words_are_warned_of(
 
 def variants(work: Workspace, name: str) -> list[str]:
     """The variants of words in the tables of a session; words.json has to list the same."""
-    found = sorted(
+    names = sorted(
         set(read_table(work.session(name).words / "submap-00000.parquet")["variant"].to_pylist())
     )
-    assert read_json(work.session(name).words_json)["variants"] == found
-    return found
+    assert read_json(work.session(name).words_json)["variants"] == names
+    return names
 
 
 def test_a_session_with_classes_beside_one_without_gets_both_kinds_of_words(

@@ -215,8 +215,8 @@ def test_the_owner_of_temporary_files_is_in_their_names(tmp_path: Path) -> None:
     from semloc_logs.tables.atomic_files import replacing_folder, stale_temporaries
 
     path = tmp_path / "folder"
-    with replacing_folder(path) as mine:
+    with replacing_folder(path) as temporary:
         assert stale_temporaries(path) == []
         with replacing_folder(path) as another:
-            assert mine.is_dir()
-            assert another != mine
+            assert temporary.is_dir()
+            assert another != temporary

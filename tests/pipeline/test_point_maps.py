@@ -53,11 +53,11 @@ def test_a_drive_is_found_in_the_points_of_another(
     stations = np.array(hdmap.json["session_T_map"]) @ hdmap.map_T_base
     for row in in_map:
         station = stations[hdmap.stamps_ns.tolist().index(row["target_stamp_ns"])]
-        found = station @ transform(
+        pose = station @ transform(
             np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"])
         )
         # the points are in the frame of Monday's odometry
         truth = drives["monday"].session_T_world @ drives["tuesday"].world_T_base(
             row["query_stamp_ns"]
         )
-        assert np.linalg.norm((inverse(truth) @ found)[:3, 3]) < 0.3
+        assert np.linalg.norm((inverse(truth) @ pose)[:3, 3]) < 0.3

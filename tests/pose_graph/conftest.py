@@ -114,8 +114,8 @@ class Drives:
             folder.mkdir()
             clouds = []
             for pose in poses:
-                near = world[np.linalg.norm(world - pose[:3, 3], axis=1) < 12.0]
-                points = apply(inverse(pose), near).astype(np.float32)
+                in_view = world[np.linalg.norm(world - pose[:3, 3], axis=1) < 12.0]
+                points = apply(inverse(pose), in_view).astype(np.float32)
                 clouds.append(Keyframe(points, np.zeros(len(points), np.uint8)))
             stamps_ns = (self.start_s[name] + np.arange(len(poses))) * SECOND
             list(keep_keyframes(folder, stamps_ns.tolist(), clouds, METADATA))

@@ -33,11 +33,13 @@ def work(drives: Any, square_of: Any) -> Any:
 
 def fence() -> F64:
     """Points (n, 3) of walls of 3 m, 8 m outside a block of 100 m."""
-    at, height = (a.ravel() for a in np.meshgrid(np.arange(-8.0, 108.0, 0.2), np.arange(0, 3, 0.3)))
+    along, height = (
+        a.ravel() for a in np.meshgrid(np.arange(-8.0, 108.0, 0.2), np.arange(0, 3, 0.3))
+    )
     sides = []
     for outside in (-8.0, 108.0):
-        sides.append(np.column_stack([at, np.full(len(at), outside), height]))
-        sides.append(np.column_stack([np.full(len(at), outside), at, height]))
+        sides.append(np.column_stack([along, np.full(len(along), outside), height]))
+        sides.append(np.column_stack([np.full(len(along), outside), along, height]))
     return np.concatenate(sides)
 
 

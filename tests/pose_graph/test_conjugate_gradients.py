@@ -86,8 +86,8 @@ def test_conjugate_gradients_give_the_poses_of_a_direct_solution(
     iterated = optimise(drives.work, SETTINGS, overwrite=True)
     assert (iterated.rejected, iterated.frames) == (direct.rejected, direct.frames) == (1, 1)
     for name, expected in zip(names, by_gtsam, strict=True):
-        found = poses_of(read_table(drives.work.optimized_trajectory(name)))
+        poses = poses_of(read_table(drives.work.optimized_trajectory(name)))
         # odometry is off by metres, closures by 0.1 m
-        assert np.abs(found[:, :3, 3] - expected[:, :3, 3]).max() < 0.03
-        turn = np.swapaxes(found[:, :3, :3], 1, 2) @ expected[:, :3, :3]
+        assert np.abs(poses[:, :3, 3] - expected[:, :3, 3]).max() < 0.03
+        turn = np.swapaxes(poses[:, :3, :3], 1, 2) @ expected[:, :3, :3]
         assert np.degrees(Rotation.from_matrix(turn).magnitude()).max() < 0.1

@@ -67,16 +67,16 @@ def test_the_closures_that_agree_are_one_set_whichever_way_they_are_given() -> N
     wrong = yaw_transform(0.0, (20.0, 20.0, 0.0))
     loops = [same_place(k) for k in (0, 1, 2, 5)] + [same_place(6, wrong)]
     for given in (loops, [turned_round(loop) if k % 2 else loop for k, loop in enumerate(loops)]):
-        (found,) = consistent_sets(drives(given), OPTIMIZE)
-        assert (found.a, found.b) == (0, 1)
-        assert sorted(found.members.tolist()) == [0, 1, 2, 3]
-        assert found.others.tolist() == [4]
-        assert found.support == 3.0  # vertices 0 and 1 lie in one stretch
+        (agreeing,) = consistent_sets(drives(given), OPTIMIZE)
+        assert (agreeing.a, agreeing.b) == (0, 1)
+        assert sorted(agreeing.members.tolist()) == [0, 1, 2, 3]
+        assert agreeing.others.tolist() == [4]
+        assert agreeing.support == 3.0  # vertices 0 and 1 lie in one stretch
 
 
 def agree(first: tuple[int, int, F64], second: tuple[int, int, F64]) -> bool:
-    (found,) = consistent_sets(drives([first, second]), OPTIMIZE)
-    return len(found.members) == 2
+    (agreeing,) = consistent_sets(drives([first, second]), OPTIMIZE)
+    return len(agreeing.members) == 2
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
@@ -111,19 +111,19 @@ def test_of_two_ends_of_the_lever_the_less_certain_one_counts(swap: bool) -> Non
     if swap:
         loops.reverse()
         sigma_rad = (0.1, 0.01)
-    (found,) = consistent_sets(drives(loops, sigma_rad), OPTIMIZE)
-    assert len(found.members) == 2
-    (found,) = consistent_sets(drives(loops, (0.01, 0.01)), OPTIMIZE)
-    assert len(found.members) == 1
+    (agreeing,) = consistent_sets(drives(loops, sigma_rad), OPTIMIZE)
+    assert len(agreeing.members) == 2
+    (agreeing,) = consistent_sets(drives(loops, (0.01, 0.01)), OPTIMIZE)
+    assert len(agreeing.members) == 1
 
 
 def test_each_pair_of_sessions_has_a_set_of_its_own() -> None:
     itself = (0, 2, yaw_transform(0.0, (2 * STEP, 0.0, 0.0)))
     loops = [same_place(0), itself, same_place(4)]
-    found = [
+    sets = [
         (s.a, s.b, sorted(s.members.tolist())) for s in consistent_sets(drives(loops), OPTIMIZE)
     ]
-    assert found == [(0, 0, [1]), (0, 1, [0, 2])]
+    assert sets == [(0, 0, [1]), (0, 1, [0, 2])]
 
 
 def test_the_most_central_of_a_set_come_first() -> None:
@@ -133,9 +133,9 @@ def test_the_most_central_of_a_set_come_first() -> None:
         same_place(2, yaw_transform(0.0, (0.0, share * most_m, 0.0)))
         for share in (0.9, 0.9, 0.5, 0.0, -0.3)
     ]
-    (found,) = consistent_sets(drives(loops), OPTIMIZE)
-    assert found.members.tolist() == [2, 3, 0, 1]
-    assert found.others.tolist() == [4]
+    (agreeing,) = consistent_sets(drives(loops), OPTIMIZE)
+    assert agreeing.members.tolist() == [2, 3, 0, 1]
+    assert agreeing.others.tolist() == [4]
 
 
 def test_the_heaviest_set_in_which_all_agree() -> None:

@@ -76,9 +76,9 @@ def test_drives_and_closures_as_geojson(located: Any, tmp_path: Path, datum: Any
         assert feature["geometry"]["type"] == "LineString"
         places = np.array(feature["geometry"]["coordinates"])
         assert len(places) == 401
-        found = np.array([local.position(lat, lon, height) for lon, lat, height in places])
+        positions = np.array([local.position(lat, lon, height) for lon, lat, height in places])
         truth = (ENU_T_COMMON @ located.true[name])[:, :3, 3]
-        assert np.linalg.norm(found - truth, axis=1).max() < 1.0
+        assert np.linalg.norm(positions - truth, axis=1).max() < 1.0
     closures = [f for f in content["features"] if f["properties"]["kind"] == "closure"]
     assert len(closures) == 10
     assert all(f["properties"]["kept"] for f in closures)

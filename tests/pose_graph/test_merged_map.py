@@ -57,8 +57,8 @@ def test_a_car_that_left_and_a_wall_that_was_built_are_changes(drives: Any, squa
     drives.add("may", square_of(1), 0.0, 1.0)
     # June starts elsewhere and faces another way
     drives.add("june", yaw_transform(np.pi / 2, (30.0, 0.0, 0.0)) @ square_of(1), 0.0, 1.0)
-    near = inverse(drives.true["may"][0]) @ drives.true["june"][0]
-    assert near[0, 3] == pytest.approx(30.0)
+    may_T_june = inverse(drives.true["may"][0]) @ drives.true["june"][0]
+    assert may_T_june[0, 3] == pytest.approx(30.0)
     drives.close([("june", k, "may", k, None) for k in range(0, 400, 40)])
     both = {(5, 20, 2): WALL, (5, 21, 2): WALL}
     _write_submap(drives, "may", both | {(40, 40, 1): CAR, (20, 5, 3): WALL})
@@ -85,12 +85,12 @@ def test_a_car_that_left_and_a_wall_that_was_built_are_changes(drives: Any, squa
     assert (wall["label"], wall["sessions"], wall["session"]) == (WALL, 2, "june")
 
     changes = read_table(drives.work.changed_voxels("june"))
-    found = dict(zip(_voxels(changes), changes.to_pylist(), strict=True))
-    assert set(found) == {own((40, 40, 1)), own((50, 10, 4))}
-    car = found[own((40, 40, 1))]
+    change_of = dict(zip(_voxels(changes), changes.to_pylist(), strict=True))
+    assert set(change_of) == {own((40, 40, 1)), own((50, 10, 4))}
+    car = change_of[own((40, 40, 1))]
     assert (car["label"], car["change"]) == (CAR, "gone")
     assert (car["occupied_session"], car["free_session"]) == ("may", "june")
-    built = found[own((50, 10, 4))]
+    built = change_of[own((50, 10, 4))]
     assert (built["label"], built["change"]) == (WALL, "appeared")
     assert (built["occupied_session"], built["free_session"]) == ("june", "may")
 

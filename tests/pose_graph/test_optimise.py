@@ -156,12 +156,12 @@ def test_closures_of_two_groups_stay_in_the_order_of_their_table(
     report = optimise(drives.work, SETTINGS)
     assert (report.frames, report.rejected) == (2, 0)
     ends = ("query_session", "query_stamp_ns")
-    expected, found = (
+    expected, kept = (
         [[row[end] for end in ends] for row in read_table(path).to_pylist()]
         for path in (drives.work.closures, drives.work.graph_closures)
     )
-    assert [session for session, _ in found] == ["d", "b", "d", "b"]
-    assert found == expected
+    assert [session for session, _ in kept] == ["d", "b", "d", "b"]
+    assert kept == expected
 
 
 def test_a_session_that_was_removed_leaves_nothing(drives: Any, square_of: Any) -> None:

@@ -20,10 +20,10 @@ def _chunks(path: Path) -> dict[str, dict[str, Any]]:
     """The columns of each entity of a recording, by the reader of rerun."""
     reader = pytest.importorskip("rerun.chunk").RrdReader(str(path))
     assert len(reader.recordings()) == len(reader.blueprints()) == 1
-    found: dict[str, dict[str, Any]] = {}
+    columns_of: dict[str, dict[str, Any]] = {}
     for chunk in reader.stream().to_chunks():
-        found.setdefault(chunk.entity_path, {}).update(chunk.to_record_batch().to_pydict())
-    return found
+        columns_of.setdefault(chunk.entity_path, {}).update(chunk.to_record_batch().to_pydict())
+    return columns_of
 
 
 def _verify(path: Path) -> None:
@@ -62,16 +62,16 @@ def test_the_recording_has_maps_drives_and_closures(
     (path,) = export(drives.work, [], "rrd", tmp_path)
     assert path.name == "drives.rrd"
     _verify(path)
-    found = _chunks(path)
-    assert {f"/{kind}/{name}" for kind in ("maps", "drives") for name in "ab"} < set(found)
-    assert len(found["/maps/a"]["Points3D:positions"][0]) == 2
-    np.testing.assert_allclose(found["/maps/a"]["Points3D:positions"][0][0], [0.15] * 3, atol=1e-3)
-    assert len(found["/closures"]["LineStrips3D:strips"][0]) == 10
-    assert len(found["/probability/b"]["Scalars:scalars"]) == 10
+    chunks = _chunks(path)
+    assert {f"/{kind}/{name}" for kind in ("maps", "drives") for name in "ab"} < set(chunks)
+    assert len(chunks["/maps/a"]["Points3D:positions"][0]) == 2
+    np.testing.assert_allclose(chunks["/maps/a"]["Points3D:positions"][0][0], [0.15] * 3, atol=1e-3)
+    assert len(chunks["/closures"]["LineStrips3D:strips"][0]) == 10
+    assert len(chunks["/probability/b"]["Scalars:scalars"]) == 10
 
     # both vehicles on the same road where closures say so
     places = {
-        name: np.array(found[f"/drives/{name}/vehicle"]["Transform3D:translation"])[:, 0]
+        name: np.array(chunks[f"/drives/{name}/vehicle"]["Transform3D:translation"])[:, 0]
         for name in "ab"
     }
     if is_optimised:
@@ -87,9 +87,9 @@ def test_drives_of_several_days_run_side_by_side(
     pytest.importorskip("rerun")
     _close(drives, square_of)
     (path,) = export(drives.work, [], "rrd", tmp_path)
-    found = _chunks(path)
+    chunks = _chunks(path)
     for name in "ab":
-        vehicle = found[f"/drives/{name}/vehicle"]
+        vehicle = chunks[f"/drives/{name}/vehicle"]
         assert [t.total_seconds() for t in vehicle["drive"]] == list(range(401))
         seconds = np.array(vehicle["time"], "datetime64[s]").astype(int)
         assert seconds.tolist() == list(range(drives.start_s[name], drives.start_s[name] + 401))

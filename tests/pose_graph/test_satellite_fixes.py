@@ -38,9 +38,9 @@ def test_fixes_take_the_drift_away_and_turn_the_frame(
     drives.close([("b", k, "a", k, None) for k in range(20, 400, 40)])  # b has no fixes
     assert optimise(drives.work, SETTINGS).frames == 1
     for name in ("a", "b"):
-        found = _in_enu(drives, name, datum)
+        poses = _in_enu(drives, name, datum)
         truth = (ENU_T_COMMON @ drives.true[name])[:, :3, 3]
-        away = np.linalg.norm((found - truth)[:, :2], axis=1)
+        away = np.linalg.norm((poses - truth)[:, :2], axis=1)
         assert np.sqrt((away**2).mean()) < 0.5
         assert away.max() < 1.5
 

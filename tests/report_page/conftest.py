@@ -165,12 +165,12 @@ class Browser:
     def requests(self) -> list[str]:
         """Addresses that the page requested, besides itself and what it holds."""
         self.run("0")
-        found = [
+        urls = [
             e["params"]["request"]["url"]
             for e in self.events
             if e.get("method") == "Network.requestWillBeSent"
         ]
-        return [url for url in found if not url.startswith(("file:", "data:", "blob:"))]
+        return [url for url in urls if not url.startswith(("file:", "data:", "blob:"))]
 
     def close(self) -> None:
         self._process.kill()

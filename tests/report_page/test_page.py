@@ -82,9 +82,9 @@ def test_names_from_logs_are_not_markup(report: Path) -> None:
 
 def test_the_data_hold_all_tables(report: Path, tables: Workspace) -> None:
     text = report.read_text(encoding="utf-8")
-    found = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)
-    assert found
-    data = json.loads(found[1])
+    data_element = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)
+    assert data_element
+    data = json.loads(data_element[1])
     assert sorted(s["name"] for s in data["sessions"]) == sorted(f.name for f in tables.sessions())
     assert data["closures"]["count"] == 30
     assert len(unpacked(data["closures"]["xy"])) == 4 * 30

@@ -28,9 +28,11 @@ from semloc_logs.workspace import Workspace
 
 def data_of(path: Path) -> dict[str, Any]:
     """The data of a page."""
-    found = re.search(r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.DOTALL)
-    assert found
-    data: dict[str, Any] = json.loads(found[1])
+    data_element = re.search(
+        r'id="data">(.*?)</script>', path.read_text(encoding="utf-8"), re.DOTALL
+    )
+    assert data_element
+    data: dict[str, Any] = json.loads(data_element[1])
     return data
 
 

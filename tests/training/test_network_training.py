@@ -62,9 +62,9 @@ def test_shards_come_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     pairs = [pair(rng) for _ in range(3)]
     write_shard(tmp_path / "shard", pairs)
-    found = read_shard(tmp_path / "shard")
+    shard = read_shard(tmp_path / "shard")
     for k in range(3):
-        np.testing.assert_array_equal(found[k], np.stack([p[k] for p in pairs]))
+        np.testing.assert_array_equal(shard[k], np.stack([p[k] for p in pairs]))
     write_shard(tmp_path / "none", [])
     assert [a.shape[0] for a in read_shard(tmp_path / "none")] == [0, 0, 0]
 

@@ -95,9 +95,9 @@ def test_frames_of_one_street_fit_together() -> None:
     tried = 0
     for a, b in pairwise(training_scene(4, frames=6).mapped):
         world = apply(a.world_T_base, a.points[a.labels == 0])
-        at = b.world_T_base[:3, 3] + 3 * b.world_T_base[:3, 0]
-        near = np.linalg.norm(world[:, :2] - at[:2], axis=1) < 1.0
-        if near.sum() > 5:
+        ahead = b.world_T_base[:3, 3] + 3 * b.world_T_base[:3, 0]
+        is_beside = np.linalg.norm(world[:, :2] - ahead[:2], axis=1) < 1.0
+        if is_beside.sum() > 5:
             tried += 1
-            assert np.median(world[near, 2]) == pytest.approx(at[2], abs=0.1)
+            assert np.median(world[is_beside, 2]) == pytest.approx(ahead[2], abs=0.1)
     assert tried > 2

@@ -31,11 +31,11 @@ def street(length: float = 60.0) -> F64:
     for left in np.arange(-18.0, length + 15.0, 7.0):
         for side in (-1.0, 1.0):
             wide, deep, high = rng.uniform([2, 2, 2], [5, 5, 5])
-            near = side * rng.uniform(5, 8)
+            front = side * rng.uniform(5, 8)
             u, z = np.meshgrid(np.arange(0, wide, step), np.arange(0, high, step))
-            parts.append(np.c_[left + u.ravel(), np.full(u.size, near), z.ravel()])
+            parts.append(np.c_[left + u.ravel(), np.full(u.size, front), z.ravel()])
             v, z = np.meshgrid(np.arange(0, deep, step), np.arange(0, high, step))
-            depth = near + side * v.ravel()
+            depth = front + side * v.ravel()
             parts += [np.c_[np.full(v.size, x), depth, z.ravel()] for x in (left, left + wide)]
     points = np.concatenate(parts)
     return points + rng.normal(0, 0.01, points.shape)

@@ -52,11 +52,11 @@ def _only(fit: StreamFit) -> str:
 
 def test_a_cloud_is_registered_with_one_that_was_moved(streets: SimpleNamespace) -> None:
     world = streets.street()
-    near = world[np.linalg.norm(world - [20, 0, 0], axis=1) < 15] - [20, 0, 0]
+    target = world[np.linalg.norm(world - [20, 0, 0], axis=1) < 15] - [20, 0, 0]
     moved = exp_se3(np.array([0.5, -0.3, 0.1]), np.radians([1.0, -2.0, 4.0]))
-    coarse = PlaneCells.of(near, 1.2)
-    fine = PlaneCells.of(near, 0.6)
-    source = (near @ inverse(moved)[:3, :3].T + inverse(moved)[:3, 3])[::5]
+    coarse = PlaneCells.of(target, 1.2)
+    fine = PlaneCells.of(target, 0.6)
+    source = (target @ inverse(moved)[:3, :3].T + inverse(moved)[:3, 3])[::5]
     fit = register(fine, source, register(coarse, source, np.eye(4)).target_T_source)
     off = inverse(moved) @ fit.target_T_source
     assert np.linalg.norm(off[:3, 3]) < 0.02

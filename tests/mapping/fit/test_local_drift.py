@@ -83,12 +83,12 @@ def test_clouds_that_do_not_meet_show_no_drift(
     assert local_drift(clouds) is None
 
 
-def stepped(at: int) -> SimpleNamespace:
+def stepped(step: int) -> SimpleNamespace:
     """Poses that step aside by 0.5 m at one of them, as where a map was corrected."""
 
     def written(poses: F64) -> F64:
         out = poses.copy()
-        out[at:, 1, 3] += 0.5
+        out[step:, 1, 3] += 0.5
         return out
 
     return SimpleNamespace(written=written)

@@ -69,8 +69,8 @@ def test_the_mounting_is_off_by_what_it_was_moved(
 ) -> None:
     """A straight drive hides each of them from the poses."""
     clouds, track = drive
-    found = offset_between(*second_sensor(clouds, offset), track.at_many)
-    measured = np.r_[found.shift, np.degrees(found.turn)]
+    offset_found = offset_between(*second_sensor(clouds, offset), track.at_many)
+    measured = np.r_[offset_found.shift, np.degrees(offset_found.turn)]
     made = np.r_[offset[:3], np.degrees(offset[3:])]
     assert measured == pytest.approx(made, abs=0.1)
     assert np.array_equal(measured != 0, made != 0)

@@ -20,8 +20,10 @@ def test_a_pair_at_a_wrong_distance_is_registered_again_and_no_other(
     share = right.share.copy()
     share[3] *= 0.5
     wrong = replace(right, pairs=replace(right.pairs, measured=measured), share=share)
-    found = searched(clouds, wrong)
-    np.testing.assert_allclose(found.pairs.measured[3], right.pairs.measured[3], atol=0.02)
+    searched_again = searched(clouds, wrong)
+    np.testing.assert_allclose(searched_again.pairs.measured[3], right.pairs.measured[3], atol=0.02)
     others = np.arange(len(right.pairs)) != 3
-    np.testing.assert_array_equal(found.pairs.measured[others], right.pairs.measured[others])
-    np.testing.assert_array_equal(found.given_share, right.given_share)
+    np.testing.assert_array_equal(
+        searched_again.pairs.measured[others], right.pairs.measured[others]
+    )
+    np.testing.assert_array_equal(searched_again.given_share, right.given_share)

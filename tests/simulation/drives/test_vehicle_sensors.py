@@ -94,8 +94,8 @@ def test_geodetic_is_the_inverse_of_the_local_frame() -> None:
 def _errors(trajectory: Trajectory, sensors: VehicleSensors, seed: int) -> tuple[F64, np.ndarray]:
     seen = fixes(trajectory, sensors, np.random.default_rng(seed))
     local = LocalFrame(*DATUM)
-    at = np.searchsorted(trajectory.stamps_ns, seen.stamps_ns)
-    pose = trajectory.world_T_base[at]
+    index = np.searchsorted(trajectory.stamps_ns, seen.stamps_ns)
+    pose = trajectory.world_T_base[index]
     true = pose[:, :3, 3] + pose[:, :3, :3] @ ANTENNA
     return np.array([local.position(*row) for row in seen.geodetic]) - true, seen.status
 
@@ -118,7 +118,7 @@ def test_outages_are_streets_long(long_drive: Trajectory) -> None:
             np.cumsum(np.linalg.norm(np.diff(long_drive.world_T_base[:, :3, 3], axis=0), axis=1)),
         ]
     )
-    at = np.interp(
+    metres = np.interp(
         fixes(long_drive, VehicleSensors(), np.random.default_rng(0)).stamps_ns,
         long_drive.stamps_ns,
         way,
@@ -131,7 +131,9 @@ def test_outages_are_streets_long(long_drive: Trajectory) -> None:
         edges = np.flatnonzero(np.diff(status))
         assert set(np.unique(status)) <= {-1, 0}
         if status[0] == 0 and len(edges) > 1:
-            lengths += [at[b] - at[a] for a, b in zip(edges[::2], edges[1::2], strict=False)]
+            lengths += [
+                metres[b] - metres[a] for a, b in zip(edges[::2], edges[1::2], strict=False)
+            ]
     assert len(lengths) > 10
     assert min(lengths) > 40
     assert max(lengths) < 330  # two that meet
@@ -140,7 +142,7 @@ def test_outages_are_streets_long(long_drive: Trajectory) -> None:
     ).status.any()
 
 
-def kitti_error(truth: F64, found: F64) -> tuple[float, float]:
+def kitti_error(truth: F64, estimate: F64) -> tuple[float, float]:
     """Mean translation error (share) and rotation error (rad/m) over segments of 100, 200, ... 800
     m (Geiger et al., CVPR 2012).
     """
@@ -154,7 +156,7 @@ def kitti_error(truth: F64, found: F64) -> tuple[float, float]:
             last = int(np.searchsorted(way, way[first] + length))
             if last < len(truth):
                 true = inverse(truth[first]) @ truth[last]
-                got = inverse(found[first]) @ found[last]
+                got = inverse(estimate[first]) @ estimate[last]
                 error = inverse(got) @ true
                 moved.append(np.linalg.norm(error[:3, 3]) / length)
                 turned.append(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)) / length)

@@ -62,15 +62,15 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("name", list(FORMATS))
 def test_our_reader_finds_the_roles_in_every_format(logs: dict[str, Path], name: str) -> None:
-    found = inspect_log(logs[name])
-    streams = found["streams"]
+    inspection = inspect_log(logs[name])
+    streams = inspection["streams"]
     assert isinstance(streams, list)
     roles = {s["topic"]: s["role"] for s in streams}
     pose = {"/tf": "tf"} if name == "protobuf" else {"/odometry": "pose", "/imu": "imu"}
     assert (
         pose | {"/lidar/points": "lidar", "/gnss": "gnss", "/tf_static": "tf_static"}
     ).items() <= roles.items()
-    assert found["problems"] == []
+    assert inspection["problems"] == []
     counts = {s["topic"]: s["count"] for s in streams}
     if name != "protobuf":
         assert counts["/imu"] > 4.5 * counts["/odometry"]
@@ -87,9 +87,9 @@ def test_every_format_fuses_to_the_same_keyframes(logs: dict[str, Path], tmp_pat
     expected_map, expected = fused(logs["mcap"], tmp_path / "mcap")
     assert len(expected) >= 4
     for name in FORMATS:
-        found_map, found = fused(logs[name], tmp_path / name)
+        found_map, keyframes = fused(logs[name], tmp_path / name)
         np.testing.assert_array_equal(found_map.stamps_ns, expected_map.stamps_ns)
-        for ours, theirs in zip(found, expected, strict=True):
+        for ours, theirs in zip(keyframes, expected, strict=True):
             np.testing.assert_allclose(ours.points, theirs.points, atol=1e-3)
             np.testing.assert_array_equal(ours.label, theirs.label)
         moved, true = (inverse(m.map_T_base[0]) @ m.map_T_base for m in (found_map, expected_map))

@@ -190,13 +190,13 @@ def test_imu_feels_gravity(log: Path) -> None:
 
 
 def test_our_reader_finds_the_roles(log: Path) -> None:
-    found = inspect_log(log)
-    streams = found["streams"]
+    inspection = inspect_log(log)
+    streams = inspection["streams"]
     assert isinstance(streams, list)
     assert {"/lidar/points": "lidar", "/odometry": "pose", "/imu": "imu"}.items() <= {
         s["topic"]: s["role"] for s in streams
     }.items()
-    assert found["problems"] == []
+    assert inspection["problems"] == []
 
 
 def test_truth_is_tum_with_nine_decimals(tmp_path: Path, trajectory: Trajectory) -> None:
@@ -294,18 +294,18 @@ def test_the_demo_meets_itself_in_both_directions(
         assert 35 < poses[-1, 0] - poses[0, 0] < 75
     a, b = (transform(p[::20, 1:4], p[::20, 4:]) for p in (monday, tuesday))
     relative = inverse(a)[:, None] @ b[None]
-    near = np.linalg.norm(relative[..., :3, 3], axis=-1) < 8
+    is_near = np.linalg.norm(relative[..., :3, 3], axis=-1) < 8
     ahead = relative[..., 0, 0]
-    assert (near & (ahead > 0.9)).any(0).sum() > 5
-    assert (near & (ahead < -0.9)).any(0).sum() > 5
+    assert (is_near & (ahead > 0.9)).any(0).sum() > 5
+    assert (is_near & (ahead < -0.9)).any(0).sum() > 5
 
 
 def test_interpolated_poses_match_the_frames(
     frames: list[DriveFrame], trajectory: Trajectory
 ) -> None:
-    at = np.array([f.stamp_ns for f in frames])
+    stamps_ns = np.array([f.stamp_ns for f in frames])
     np.testing.assert_allclose(
-        interpolate(trajectory.stamps_ns, trajectory.world_T_base, at),
+        interpolate(trajectory.stamps_ns, trajectory.world_T_base, stamps_ns),
         [f.world_T_base for f in frames],
         atol=1e-9,
     )

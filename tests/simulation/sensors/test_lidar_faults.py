@@ -236,9 +236,9 @@ def test_half_of_the_errors_stay_from_frame_to_frame() -> None:
 def test_errors_are_alike_nearby() -> None:
     points, labels = grid_of_labels()
     wrong = (corrupt_labels(points, labels, 1, 0.12, frame=0) != labels).reshape(400, 400)
-    near = wrong[2:][wrong[:-2]].mean()
+    share_near = wrong[2:][wrong[:-2]].mean()
     far = wrong[100:][wrong[:-100]].mean()
-    assert near > 0.5
+    assert share_near > 0.5
     assert far < 0.25
 
 

@@ -45,10 +45,10 @@ def inliers(a: U8, b: U8) -> int:
 def test_neighbouring_pictures_match_and_others_do_not(painter: Painter) -> None:
     """More than 100 inliers from 1.5 m away, fewer than 30 from another place."""
     rng = np.random.default_rng(0)
-    here, near, elsewhere = (painter.picture(pose(x), rng, STEREO) for x in (30.0, 31.5, 110.0))
+    here, beside, elsewhere = (painter.picture(pose(x), rng, STEREO) for x in (30.0, 31.5, 110.0))
     assert here.shape == (360, 640, 3)
     assert here.dtype == np.uint8
-    assert inliers(here, near) > 100
+    assert inliers(here, beside) > 100
     assert inliers(here, elsewhere) < 30
 
 
@@ -63,9 +63,9 @@ def test_depth_comes_back_from_a_pair(painter: Painter) -> None:
         0, 112, 5, 200, 800, 1, 31, 10, 100, 2, mode=cv2.STEREO_SGBM_MODE_HH
     )
     disparity = matcher.compute(*(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in pair)) / 16
-    found = (disparity > 1) & np.isfinite(hits.depth)
-    error = disparity[found] - STEREO.focal * STEREO.baseline / hits.depth[found]
-    assert found.sum() > 0.5 * np.isfinite(hits.depth).sum()
+    is_matched = (disparity > 1) & np.isfinite(hits.depth)
+    error = disparity[is_matched] - STEREO.focal * STEREO.baseline / hits.depth[is_matched]
+    assert is_matched.sum() > 0.5 * np.isfinite(hits.depth).sum()
     assert abs(np.median(error)) < 0.2
     assert (np.abs(error) < 1).mean() > 0.7
 
@@ -118,11 +118,11 @@ def test_a_box_casts_a_shadow() -> None:
 
 def test_noise_fades_with_the_size_of_the_pixel() -> None:
     points = np.random.default_rng(0).uniform(-50, 50, (2000, 3)).astype(np.float32)
-    near, far = (
+    fine, far = (
         octaves(points, np.full(2000, f, np.float32), Octaves(1.0, 4, 0.8), 3) for f in (0.001, 3.0)
     )
-    assert 0.2 < near.std() < 1.5
-    assert abs(near.mean()) < 0.1
+    assert 0.2 < fine.std() < 1.5
+    assert abs(fine.mean()) < 0.1
     assert not far.any()
 
 

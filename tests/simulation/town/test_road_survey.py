@@ -29,8 +29,8 @@ def eight(radius: float = 50.0, slope: float = 0.0) -> F64:
     t = np.linspace(0, 2 * np.pi, int(2 * np.pi * radius * 1.3))
     plan = np.column_stack([np.sin(t), np.sin(2 * t)]) * radius
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(plan, axis=0), axis=1))])
-    at = np.arange(0.0, along[-1])
-    plan = np.column_stack([np.interp(at, along, plan[:, k]) for k in (0, 1)])
+    metres = np.arange(0.0, along[-1])
+    plan = np.column_stack([np.interp(metres, along, plan[:, k]) for k in (0, 1)])
     return np.column_stack([plan, slope * plan[:, 0]])
 
 

@@ -391,11 +391,11 @@ def test_routes_stay_on_the_road_and_keep_islands_to_their_left() -> None:
         assert ground.beside[ground.cell(*line.T)].max() < 0
         for circle in network.roundabouts.values():
             arm = line - [circle.x, circle.y]
-            near = np.flatnonzero(np.linalg.norm(arm[:-1], axis=1) < circle.lane + 0.6)
+            in_circle = np.flatnonzero(np.linalg.norm(arm[:-1], axis=1) < circle.lane + 0.6)
             assert np.linalg.norm(arm, axis=1).min() > circle.inner + 1.0
-            step = np.diff(line, axis=0)[near]
-            assert (arm[near, 0] * step[:, 1] - arm[near, 1] * step[:, 0] > 0).all()
-            rounded += len(near)
+            step = np.diff(line, axis=0)[in_circle]
+            assert (arm[in_circle, 0] * step[:, 1] - arm[in_circle, 1] * step[:, 0] > 0).all()
+            rounded += len(in_circle)
     assert rounded > 100
 
 
