@@ -1,7 +1,8 @@
 """Phrases that readers stumble over, in code and documents; exit code 1 if there are any.
 
 Only comments, docstrings, texts and Markdown count; code in Markdown does not. CONTRIBUTING.md
-lists what to write instead. Local names in the package that do not say what a value is count, too.
+lists what to write instead. Local names in the package and the tests that do not say what a value
+is count, too.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def main() -> int:
             if match := PATTERN.search(line):
                 count += 1
                 print(f"{name}:{number}: '{match.group(0).strip()}': {line.strip()[:90]}")
-        if name.startswith(("semloc_logs/", "cli/")) and path.suffix == ".py":
+        if name.startswith(("semloc_logs/", "cli/", "tests/")) and path.suffix == ".py":
             for number, word in empty_names(path):
                 count += 1
                 print(f"{name}:{number}: '{word}' does not say what the value is")
