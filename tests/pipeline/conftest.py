@@ -22,6 +22,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.engines import Engine, Serial
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.numerics.transforms import exp_se3, interpolate, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.simulation.drives.drive import simulate_drive
@@ -43,8 +44,10 @@ from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.stages import close as close_stage
 from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
+from semloc_logs.stages.report import Report
 from semloc_logs.workspace import Workspace
+from tests.pipeline.fusions import Fuse
 
 F64 = NDArray[np.float64]
 START_NS = 1_760_000_000_123_456_789
@@ -298,3 +301,26 @@ def coarse(_coarse: Workspace, tmp_path: Path) -> Iterator[Workspace]:
     """Monday and Tuesday, closed under coarse settings; a copy that belongs to the test."""
     yield Workspace(Path(shutil.copytree(_coarse.path, tmp_path / "work")))
     shutil.rmtree(tmp_path / "work")
+
+
+@pytest.fixture
+def fuse(tools: SimpleNamespace, drives: dict[str, Drive], coarse: Workspace) -> Fuse:
+    """Fuses Monday into the workspace ``coarse``, where it was fused before, with whatever differs
+    from then.
+    """
+
+    def again(
+        logs: list[Path] | None = None,
+        settings: Resolved | None = None,
+        topics: dict[str, str] | None = None,
+        poses: TrajectoryFile | None = None,
+        overwrite: bool = False,
+    ) -> Report:
+        monday = tuple(logs or [drives["monday"].log])
+        session = SessionInput("monday", monday, topics or {}, poses)
+        settings = settings or tools.coarse_settings()
+        return fuse_stage.fuse(
+            [session], coarse, settings, Serial(), redo=Redo.of(overwrite=overwrite)
+        )
+
+    return again
