@@ -5,22 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.alignment.mask_grid import (
-    ANY_BIT,
-    FREE_BIT,
-    MaskGrid,
-    class_bits,
-    look_up,
-)
+from semloc_logs.alignment.mask_grid import ANY_BIT, FREE_BIT, MaskGrid, class_bits, look_up
 from semloc_logs.voxels.grid import FREE_STATE
-from tests.alignment.voxel_maps import (
-    COARSE,
-    V,
-    block_map,
-    mask_grid_of,
-    occupied,
-    random_cells,
-)
+from tests.alignment.voxel_maps import COARSE, V, block_map, mask_grid_of, occupied, random_cells
 
 
 def test_class_bits_by_hand() -> None:

@@ -12,15 +12,9 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment import search as search_module
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
-from semloc_logs.alignment.mask_grid import (
-    FREE_BIT,
-    look_up,
-)
+from semloc_logs.alignment.mask_grid import FREE_BIT, look_up
 from semloc_logs.alignment.query_map import Query
-from semloc_logs.alignment.scores import (
-    MutualScores,
-    Scores,
-)
+from semloc_logs.alignment.scores import MutualScores, Scores
 from semloc_logs.alignment.search import Candidate, search, search_hypotheses
 from semloc_logs.alignment.target_map import Target
 from semloc_logs.numerics.transforms import apply, yaw_transform

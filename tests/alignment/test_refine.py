@@ -15,14 +15,7 @@ from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
 from semloc_logs.alignment.search import Candidate
 from semloc_logs.alignment.target_map import PLANE_NOISE, UNCERTAIN_RADII, Target
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
-from tests.alignment.voxel_maps import (
-    F64,
-    V,
-    block_map,
-    moved,
-    points_of,
-    town,
-)
+from tests.alignment.voxel_maps import F64, V, block_map, moved, points_of, town
 
 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.alignment.mask_grid import (
-    ANY_BIT,
-)
+from semloc_logs.alignment.mask_grid import ANY_BIT
 from semloc_logs.alignment.query_map import Query, structure_mask
 from semloc_logs.alignment.scores import (
     MutualScores,
@@ -20,13 +18,7 @@ from semloc_logs.alignment.scores import (
 from semloc_logs.alignment.surface import thin_points
 from semloc_logs.alignment.target_map import Target
 from semloc_logs.labels.space import UNLABELLED
-from tests.alignment.voxel_maps import (
-    Cell,
-    V,
-    block_map,
-    evidence_of,
-    points_of,
-)
+from tests.alignment.voxel_maps import Cell, V, block_map, evidence_of, points_of
 
 
 def test_structure_scores_by_hand() -> None:

@@ -12,14 +12,7 @@ from semloc_logs.alignment.tau import tau
 from semloc_logs.numerics.transforms import exp_se3, yaw_transform
 from semloc_logs.voxels.grid import UNOBSERVED_STATE, empty_map
 from semloc_logs.voxels.keys import BLOCK
-from tests.alignment.voxel_maps import (
-    COARSE,
-    Cell,
-    V,
-    block_map,
-    occupied,
-    random_cells,
-)
+from tests.alignment.voxel_maps import COARSE, Cell, V, block_map, occupied, random_cells
 
 
 def slow_tau(

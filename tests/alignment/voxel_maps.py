@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.mask_grid import (
-    ANY_BIT,
-    MaskGrid,
-    build_mask_grid,
-    class_bits,
-)
+from semloc_logs.alignment.mask_grid import ANY_BIT, MaskGrid, build_mask_grid, class_bits
 from semloc_logs.alignment.query_map import Evidence
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, inverse

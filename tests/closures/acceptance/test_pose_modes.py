@@ -9,14 +9,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from semloc_logs.closures.acceptance.consistency import (
-    place_odds,
-)
+from semloc_logs.closures.acceptance.consistency import place_odds
 from semloc_logs.closures.acceptance.decide import decide
-from semloc_logs.closures.acceptance.placements import (
-    pairs_of,
-    place,
-)
+from semloc_logs.closures.acceptance.placements import pairs_of, place
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
