@@ -52,6 +52,60 @@ def test_the_saved_end_comes_back(log: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert not recover(log)
 
 
+def test_a_new_end_that_is_complete_stays(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run was killed when only the saved end was left to remove."""
+
+    def killed(side: Path) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, locked(log) as fd:
+        patch.setattr(tail_swap, "remove_file", killed)
+        with pytest.raises(KeyboardInterrupt):
+            swap_tail(log, fd, AppendPlan(START, OLD, NEW))
+    assert recover(log)
+    assert log.read_bytes() == RECORDED + NEW
+    assert list(log.parent.iterdir()) == [log]
+
+
+@pytest.mark.parametrize(
+    ("size", "fits"),  # from where the end starts to the longer of both ends
+    [(START - 1, False), (START, True), (START + len(NEW), True), (START + len(NEW) + 1, False)],
+)
+def test_how_long_the_log_of_a_saved_end_may_be(
+    log: Path, monkeypatch: pytest.MonkeyPatch, size: int, fits: bool
+) -> None:
+    side = interrupted(log, monkeypatch)
+    os.truncate(log, size)
+    if fits:
+        assert recover(log)
+        assert log.read_bytes() == RECORDED + OLD
+    else:
+        with pytest.raises(LogError, match="is not the saved end of this state"):
+            recover(log)
+        assert log.stat().st_size == size
+    assert side.exists() == (not fits)
+
+
+def test_a_log_beside_which_a_run_died_while_saving_needs_no_repair(log: Path) -> None:
+    """Its end was not touched yet: only the half of it that was saved goes away."""
+    log.with_name(".log.mcap.semloc-tail.elsewhere-1-abc-123.tmp").write_bytes(b"half an end")
+    assert not recover(log)
+    assert list(log.parent.iterdir()) == [log]
+    assert log.read_bytes() == RECORDED + OLD
+
+
+def test_without_a_saved_end_a_log_is_not_opened_nor_one_without_a_log(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process may hold the log, and a saved end waits until its log is there again."""
+    with locked(log):
+        assert not recover(log)
+    side = interrupted(log, monkeypatch)
+    log.unlink()
+    assert not recover(log)
+    assert side.exists()
+
+
 def test_an_end_that_stays_is_not_written(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tail_swap, "_save", None)
     monkeypatch.setattr(tail_swap, "_write_tail", None)
@@ -164,3 +218,20 @@ def test_a_log_that_becomes_shorter_while_it_is_copied(
         assert copy.read_bytes() == RECORDED
         with pytest.raises(LogError, match=rf"became shorter .*\(at offset {START + len(OLD)}\)"):
             copy_start(source, target, START + len(OLD) + 1)
+
+
+@pytest.mark.parametrize("has_quick_copy", [True, False])
+def test_no_more_than_the_start_of_a_log_is_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_quick_copy: bool
+) -> None:
+    """A block of 1 MiB and 5 bytes of the next one; the log has 20 more."""
+    if not has_quick_copy:
+        monkeypatch.delattr(os, "copy_file_range", raising=False)
+    data = bytes(range(256)) * (1 << 12) + b"five and many more bytes."
+    log = tmp_path / "log.mcap"
+    log.write_bytes(data)
+    copy = tmp_path / "copy"
+    copy.touch()
+    with locked(log, shared=True) as source, locked(copy) as target:
+        copy_start(source, target, (1 << 20) + 5)
+    assert copy.read_bytes() == data[:-20]
