@@ -115,7 +115,7 @@ class Calibration:
 
     def log_odds(self, values: F64) -> F64:
         """Of values (..., d)."""
-        x = np.clip(np.nan_to_num(values, nan=0.0, posinf=1e3, neginf=-1e3), self.low, self.high)
+        x = np.clip(np.nan_to_num(values, nan=0.0), self.low, self.high)
         return np.asarray(x @ np.array(self.weights) + self.bias)
 
     @classmethod
@@ -180,7 +180,7 @@ def shipped() -> Model:
     )
 
 
-def fit_logistic(x: F64, right: Bools, ridge: float = 1.0) -> tuple[F64, float]:
+def fit_logistic(x: F64, right: Bools, ridge: float) -> tuple[F64, float]:
     """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d)."""
     mean = x.mean(0)
     scale = x.std(0) + 1e-9

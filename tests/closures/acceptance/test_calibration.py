@@ -198,6 +198,22 @@ def test_additions_are_to_log_odds_that_are_known() -> None:
     assert abs(fit_additions(x[:, :1], right, 1e-9, np.zeros(4000))[0] - 1.0) > 0.2
 
 
+def test_a_ridge_holds_weights_back_by_hand() -> None:
+    """One right and one wrong, scaled to 1 and -1: 2 (1 - p) = ridge w, with p = 3/4 at w = log 3.
+
+    Their mean is 3 and their standard deviation 2, so the weight of the values is half of w.
+    """
+    ridge = 0.5 / np.log(3)
+    x = np.array([[5.0], [1.0]])
+    right = np.array([True, False])
+    w, b = fit_logistic(x, right, ridge)
+    np.testing.assert_allclose([*w, b], [np.log(3) / 2, -3 * np.log(3) / 2], rtol=1e-9)
+    # additions have no bias: the values 2 and -2
+    np.testing.assert_allclose(
+        fit_additions(x - 3.0, right, ridge, np.zeros(2)), [np.log(3) / 2], rtol=1e-9
+    )
+
+
 def test_logistic_regression_recovers_known_weights() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(0, 1, (20_000, 3)) * [1, 5, 0.1] + [0, 20, -1]
@@ -212,11 +228,11 @@ def test_logistic_regression_recovers_known_weights() -> None:
 
 def test_logistic_regression_of_separable_and_of_constant_features_stays_finite() -> None:
     x = np.c_[np.linspace(-1, 1, 40), np.full(40, 3.0)]
-    w, b = fit_logistic(x, x[:, 0] > 0)
+    w, b = fit_logistic(x, x[:, 0] > 0, ridge=1.0)
     p = 1 / (1 + np.exp(-(x @ w + b)))
     assert np.isfinite(w).all()
     assert ((p > 0.5) == (x[:, 0] > 0)).all()
-    w, b = fit_logistic(x, np.ones(40, bool))
+    w, b = fit_logistic(x, np.ones(40, bool), ridge=1.0)
     assert (1 / (1 + np.exp(-(x @ w + b))) > 0.99).all()
 
 
