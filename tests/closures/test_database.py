@@ -40,12 +40,15 @@ def drive_session(
     submaps: list[tuple[int, int]],
     words: list[NDArray[np.float64]],
     saw: tuple[tuple[float, float], ...] = ((0.0, 5.0),),
+    *,
+    topics: tuple[str, ...] = ("/points",),
+    sigma: float | None = None,
 ) -> SessionMap:
     """A session along ``road`` (n, 2), a keyframe every second, with words at ``words`` (m, 3)
     of each submap of keyframes.
 
     Each keyframe ``saw`` points ahead and to its left, metres, at the height of its number in
-    decimetres.
+    decimetres, their ranges known to ``sigma``. The ``topics`` take turns.
     """
     folder = work.session(name)
     n = len(road)
@@ -56,7 +59,7 @@ def drive_session(
         "keyframe": np.arange(n),
         "stamp_ns": (np.arange(n) * 1e9).astype(np.int64),
         "log_time_ns": np.arange(n),
-        "topic": ["/points"] * n,
+        "topic": [topics[i % len(topics)] for i in range(n)],
         "posed": [True] * n,
         "distance": road_distance(poses),
         "ground_z": np.zeros(n),
@@ -66,8 +69,10 @@ def drive_session(
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", columns), {})
+    label = np.full(len(saw), 2, np.uint8)
+    sigmas = None if sigma is None else np.full(len(saw), sigma, np.float32)
     clouds = [
-        Keyframe(np.array([[*p, 0.1 * i] for p in saw], np.float32), np.full(len(saw), 2, np.uint8))
+        Keyframe(np.array([[*p, 0.1 * i] for p in saw], np.float32), label, sigmas)
         for i in range(n)
     ]
     list(keep_keyframes(folder.keyframes, range(n), clouds, {}))
@@ -228,7 +233,7 @@ def test_a_surface_is_made_from_so_many_keyframes(tmp_path: Path) -> None:
 
 
 def test_a_surface_of_a_long_query_has_so_many_keyframes_for_each_radius(tmp_path: Path) -> None:
-    """About number 5 lie 5 keyframes within half of 20 m, 9 within half of 36 m."""
+    """About number 5 lie 5 keyframes within half of 16 m, 9 within half of 36 m."""
     road = np.stack([np.arange(11) * 4.0, np.zeros(11)], 1)
     drive_session(Workspace(tmp_path), "a", road, [(0, 11)], [np.zeros((0, 3))])
 
@@ -238,8 +243,50 @@ def test_a_surface_of_a_long_query_has_so_many_keyframes_for_each_radius(tmp_pat
         surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW).surface
         return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
 
-    assert heights(20.0) == [3, 5, 7]  # three of five: less than a radius, 24 m
+    assert heights(16.0) == [3, 5, 7]  # three of five: less than a radius, 24 m
     assert heights(36.0) == [1, 3, 5, 7, 9]  # one and a half radii: 4.5, so five of nine
+
+
+@pytest.mark.parametrize(
+    ("sigma", "topics", "chosen"),
+    [
+        (None, ("/points",), [4, 5, 6]),
+        (0.02, ("/points",), [4, 5, 6]),
+        (0.2, ("/points",), [2, 4, 6]),  # of the six nearest, 2 to 7
+        (0.2, ("/left", "/right"), [2, 3, 6, 7]),  # of 2, 4 and 6, and of 3, 5 and 7
+    ],
+)
+def test_of_uncertain_ranges_every_second_keyframe_of_a_longer_stretch_makes_the_surface(
+    tmp_path: Path, sigma: float | None, topics: tuple[str, ...], chosen: list[int]
+) -> None:
+    road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
+    none = np.zeros((0, 3))
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [none], topics=topics, sigma=sigma)
+    settings = Settings.model_validate({"closures": {"surface_keyframes": 3}}).resolved()
+    database = Database(Workspace(tmp_path), ("a",), settings)
+    found = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+    assert found.keyframes.tolist() == chosen
+
+
+@pytest.mark.parametrize(
+    ("topics", "middles"),
+    [
+        (("/points",), [2, 2, 7]),  # of stretches of 4.8 m: numbers 0 to 4, and 5 to 9
+        (("/left", "/right"), [2, 3, 7]),  # of 0, 2 and 4; of 1 and 3; of 5, 7 and 9
+    ],
+)
+def test_queries_at_one_stretch_and_sensor_share_its_middle_keyframe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topics: tuple[str, ...], middles: list[int]
+) -> None:
+    road = np.stack([np.arange(10.0), np.zeros(10)], 1)
+    none = np.zeros((0, 3))
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [none], topics=topics)
+    seen: list[Any] = []
+    monkeypatch.setattr(target_surface_module, "_surface", lambda found: seen.append(found))
+    for number in (0, 1, 9):
+        database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
+        target_surface(everything(database), 0, np.array([number, 0.0, 0.0]) + VIEW)
+    assert [found.middle for found in seen] == middles
 
 
 def test_places_of_one_square_share_what_was_seen_from_afar_about_its_centre(
