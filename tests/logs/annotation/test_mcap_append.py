@@ -358,6 +358,24 @@ def test_an_empty_log_has_the_times_of_its_results() -> None:
     assert summary.statistics.message_end_time == 9
 
 
+def test_messages_are_counted_on_each_channel() -> None:
+    start, end = empty_end("", "test")
+    channels = [CHANNEL, replace(CHANNEL, topic="/semloc/y")]
+    messages = [NewMessage(channel, 5, b"{}") for channel in (0, 0, 1, 0, 1)]
+    added = start + plan_append(end, channels, messages, "semloc/x", {}).new_tail
+    found = [
+        (channel.topic, message.sequence)
+        for _, channel, message in make_reader(io.BytesIO(added)).iter_messages()
+    ]
+    assert sorted(found) == [
+        ("/semloc/x", 0),
+        ("/semloc/x", 1),
+        ("/semloc/x", 2),
+        ("/semloc/y", 0),
+        ("/semloc/y", 1),
+    ]
+
+
 def test_every_index_leads_to_its_message(tmp_path: Path) -> None:
     """From a chunk index to the message index of each channel, from there into the chunk."""
     log = tmp_path / "log.mcap"
