@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from semloc_logs.closures.acceptance import decide
-from semloc_logs.closures.acceptance.calibration import Calibration, Model, shipped
+from semloc_logs.closures.acceptance.calibration import (
+    Calibration,
+    Model,
+    probability_of,
+    shipped,
+)
 from semloc_logs.closures.acceptance.decide import weakest, why_rejected
 from semloc_logs.closures.closure import (
     Agreement,
@@ -171,6 +176,22 @@ def test_a_right_place_with_several_pose_modes() -> None:
         " odds"
     )
     assert why(decision(0.999, 0.86, 0.9)) is Reason.UNCERTAIN_POSITION
+
+
+def test_as_much_as_is_required_is_enough() -> None:
+    """Of the probability and of each of its factors: they do not reject."""
+    loose = decision(0.99, vetoes=frozenset({Veto.LOOSE_FIT}))
+    assert loose.probability == loose.min_probability
+    assert why(loose) is Reason.LOOSE_FIT
+    assert why(decision(0.99, confidence=0.9)) is Reason.UNCERTAIN_POSITION
+    assert why(decision(0.99, confidence=0.9, share=0.9)) is Reason.UNCERTAIN_POSITION
+    votes = dataclasses.replace(SURE, own_probability=0.99)
+    assert why(decision(0.5), votes) is Reason.NEIGHBOURS_CONFLICT
+    weak = dataclasses.replace(GOOD, contradiction=0.03)
+    by_itself = float(probability_of(MODEL.own_log_odds(weak)))
+    rivals = dataclasses.replace(decision(0.5), min_probability=by_itself)
+    votes = dataclasses.replace(SURE, own_probability=0.5)
+    assert why(rivals, votes, weak) is Reason.RIVAL_PLACE
 
 
 def test_every_reason_has_a_sentence() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,14 @@ def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
     pairs = pairs_of(placed)
     assert {pair: r.tolist() for pair, r in pairs.items()} == both
     assert {pair: r.tolist() for pair, r in posed_pairs(placed, pairs).items()} == {("b", "a"): [2]}
+
+
+def test_alignments_of_a_query_are_ordered_by_place() -> None:
+    """By x, then y, then z."""
+    places = [(1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 2.0)]
+    rows = [alignment(0, 0.5) for _ in places]
+    placed = dataclasses.replace(
+        place(rows, MAPS, MODEL),
+        target_T_query=np.array([yaw_transform(0.0, where) for where in places]),
+    )
+    assert pairs_of(placed)["a", "b"].tolist() == [3, 2, 1, 0]
