@@ -15,9 +15,11 @@ from semloc_logs.engines import Serial
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
-from semloc_logs.settings import Settings
+from semloc_logs.pictures import map_picture, times
+from semloc_logs.progress import Progress, listening
+from semloc_logs.settings import Settings, load
 from semloc_logs.stages import fuse as fuse_stage
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import Redo, SessionInput
 from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.workspace import Workspace
 from tests.pipeline.fusions import Fuse, log_of, quick_fusion, was_done
@@ -135,8 +137,10 @@ def test_the_amount_is_the_seconds_of_all_logs(
 
     def quick(task: FuseTask, **options: Any) -> FusedSession:
         logs = [
-            {"start_ns": None if end is None else 0, "end_ns": None if end is None else end * 10**9}
-            for end in seconds[task.folder.name]
+            {"start_ns": None, "end_ns": None}
+            if length is None
+            else {"start_ns": 7 * 10**9, "end_ns": (7 + length) * 10**9}
+            for length in seconds[task.folder.name]
         ]
         counts = {"keyframes": 0, "voxels": 0, "label_source": "log"}
         write_json(task.folder.session_json, counts)
@@ -178,3 +182,48 @@ def test_workers_in_another_folder_find_the_log_and_the_workspace(
     [task] = fuse_stage.plan_fuse([session], Workspace(Path("w")), Settings().resolved()).tasks
     assert task.logs == (tmp_path / "a.mcap",)
     assert task.folder.path == Workspace(tmp_path / "w").session("a").path
+
+
+def test_each_session_is_reported_when_it_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that failed counts, too."""
+    fuse = quick_fusion(monkeypatch)
+    events: list[Progress] = []
+    with listening(events.append):
+        fuse(Workspace(tmp_path / "work"), "a", "bad", "c")
+    assert events == [Progress("fuse", "", done, 3, "sessions") for done in range(4)]
+
+
+@pytest.mark.parametrize(("overwrite", "hit"), [(False, 0.8), (True, 0.9)])
+def test_overwriting_gives_the_workspace_other_settings_of_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overwrite: bool, hit: float
+) -> None:
+    quick_fusion(monkeypatch)
+    work = Workspace(tmp_path / "work")
+    for given, redo in (("0.8", Redo.NOTHING), ("0.9", Redo.of(overwrite=overwrite))):
+        settings = load(assignments={"fusion.hit": given}).resolved()
+        fuse_stage.fuse([log_of(tmp_path, "a")], work, settings, Serial(), redo=redo)
+    assert read_json(work.settings)["settings"]["fusion"]["hit"] == hit
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_a_map_is_drawn_with_its_drive_and_period(
+    posed: bool, coarse: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without poses only the map is drawn."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(map_picture, "draw_map", lambda *given: drawn.append(given))
+    monkeypatch.setattr(times, "period_text", lambda first, last: f"{first} to {last}")
+    folder = coarse.session("monday")
+    content = read_json(folder.session_json) | {"posed": posed}
+    fuse_stage._draw(folder, content)
+    [(voxels, positions, caption, picture)] = drawn
+    assert (voxels, picture) == (folder.voxels, folder.picture)
+    frames = read_table(folder.frames)
+    expected = np.column_stack([frames[f"t_{c}"].to_numpy() for c in "xyz"])
+    np.testing.assert_allclose(positions, expected if posed else np.zeros((0, 3)))
+    stamps = frames["stamp_ns"].to_pylist()
+    assert caption == map_picture.Caption(
+        "monday", content["label_source"], content["voxel_size"], f"{stamps[0]} to {stamps[-1]}"
+    )
