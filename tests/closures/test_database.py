@@ -264,8 +264,8 @@ def test_of_uncertain_ranges_every_second_keyframe_of_a_longer_stretch_makes_the
     drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [none], topics=topics, sigma=sigma)
     settings = Settings.model_validate({"closures": {"surface_keyframes": 3}}).resolved()
     database = Database(Workspace(tmp_path), ("a",), settings)
-    found = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
-    assert found.keyframes.tolist() == chosen
+    surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+    assert surface.keyframes.tolist() == chosen
 
 
 @pytest.mark.parametrize(
@@ -282,11 +282,11 @@ def test_queries_at_one_stretch_and_sensor_share_its_middle_keyframe(
     none = np.zeros((0, 3))
     drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [none], topics=topics)
     seen: list[Any] = []
-    monkeypatch.setattr(target_surface_module, "_surface", lambda found: seen.append(found))
+    monkeypatch.setattr(target_surface_module, "_surface", lambda surface: seen.append(surface))
     for number in (0, 1, 9):
         database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
         target_surface(everything(database), 0, np.array([number, 0.0, 0.0]) + VIEW)
-    assert [found.middle for found in seen] == middles
+    assert [surface.middle for surface in seen] == middles
 
 
 def test_places_of_one_square_share_what_was_seen_from_afar_about_its_centre(

@@ -363,11 +363,11 @@ def test_messages_are_counted_on_each_channel() -> None:
     channels = [CHANNEL, replace(CHANNEL, topic="/semloc/y")]
     messages = [NewMessage(channel, 5, b"{}") for channel in (0, 0, 1, 0, 1)]
     added = start + plan_append(end, channels, messages, "semloc/x", {}).new_tail
-    found = [
+    sequences = [
         (channel.topic, message.sequence)
         for _, channel, message in make_reader(io.BytesIO(added)).iter_messages()
     ]
-    assert sorted(found) == [
+    assert sorted(sequences) == [
         ("/semloc/x", 0),
         ("/semloc/x", 1),
         ("/semloc/x", 2),
