@@ -137,7 +137,7 @@ def fit_models(args: argparse.Namespace) -> None:
     content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"
     (args.dir / "calibration.json").write_text(content)
 
-    report = report_of(judged, fitted.probability)
+    report = report_of(fitted.judged, fitted.probability)
     (args.dir / "acceptance.md").write_text(report.markdown())
     (args.dir / "acceptance.json").write_text(json.dumps(report.to_json(), indent=1) + "\n")
     print(report.markdown())
@@ -147,7 +147,7 @@ def fit_models(args: argparse.Namespace) -> None:
             fitted.alone[ordinary], judged.right[ordinary]
         ),
         "with neighbours": reliability(
-            fitted.probability[judged.clear], judged.right[judged.clear]
+            fitted.probability[fitted.judged.clear], fitted.judged.right[fitted.judged.clear]
         ),
     }
     draw_reliability(args.dir / "reliability.png", curves)
@@ -159,7 +159,7 @@ def fit_models(args: argparse.Namespace) -> None:
 def report(args: argparse.Namespace) -> None:
     """Print what the calibration of the package does in the towns of some folders."""
     judged = judged_towns(args.dirs)
-    print(report_of(judged, decided_by(shipped(), judged)).markdown())
+    print(report_of(*decided_by(shipped(), judged)).markdown())
 
 
 def judged_towns(folders: Sequence[Path]) -> Judged:

@@ -101,8 +101,7 @@ def search_towns(args: argparse.Namespace) -> None:
     paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries) + collect(
         place, CAMERAS, args.jobs
     )
-    judged = read_judged(paths)
-    p = decided_by(shipped(), judged)
+    judged, p = decided_by(shipped(), read_judged(paths))
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
     print(report_of(judged, p).markdown())
     accepted = (k for k in answers(judged, p) if p[k] >= SURE)

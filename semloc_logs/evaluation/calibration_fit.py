@@ -28,6 +28,7 @@ from semloc_logs.closures.acceptance.calibration import (
     probability_of,
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
+from semloc_logs.closures.acceptance.joint_poses import JointPoses, joint_poses
 from semloc_logs.closures.acceptance.placements import contradicts_odometry, pairs_of
 from semloc_logs.closures.closure import Agreement
 from semloc_logs.evaluation.acceptance_report import SURE
@@ -163,25 +164,35 @@ def _held_out(judged: Judged) -> Iterator[tuple[NDArray[np.int64], Bools]]:
         yield of_town, others
 
 
-def decided_by(model: Model, judged: Judged) -> F64:
-    """The probabilities (n,) that the acceptance gives with ``model``, 0 where there is a veto."""
+def decided_by(model: Model, judged: Judged) -> tuple[Judged, F64]:
+    """The alignments with the poses that the acceptance gives them with ``model``, and their
+    probabilities (n,), 0 where there is a veto.
+    """
     own = model.own_log_odds(judged.features)
     agreement = agreement_of(judged, own)
-    p = probability(judged, own, model.log_odds(own, agreement))
-    return np.where(model.is_ambiguous(agreement) | ~possible(judged), 0.0, p)
+    p, joint = probability(judged, own, model.log_odds(own, agreement))
+    vetoed = model.is_ambiguous(agreement) | ~possible(judged)
+    return judged.with_poses(joint), np.where(vetoed, 0.0, p)
 
 
-def probability(judged: Judged, own: F64, with_votes: F64) -> F64:
-    """The product of the factors (n,), of log-odds ``own`` and ``with_votes`` (n,)."""
-    out = position_confidence(judged.placed.sigma, judged.voxel_size)
+def probability(judged: Judged, own: F64, with_votes: F64) -> tuple[F64, JointPoses]:
+    """The product of the factors (n,), of log-odds ``own`` and ``with_votes`` (n,), and the poses
+    of which it is.
+    """
+    p = np.zeros(len(judged))
+    joint = JointPoses(np.zeros_like(judged.error), judged.uncertain.covariance.copy())
     for of_town in _towns(judged):
         placed = judged.placed.part(of_town)
         pairs = pairs_of(placed)
-        out[of_town] *= place_odds(
-            placed, pairs, with_votes[of_town], judged.voxel_size
-        ).place_probability
-        out[of_town] *= place_odds(placed, pairs, own[of_town], judged.voxel_size).mode_share
-    return out
+        total = place_odds(placed, pairs, with_votes[of_town], judged.voxel_size)
+        mode_share = place_odds(placed, pairs, own[of_town], judged.voxel_size).mode_share
+        p[of_town] = total.place_probability * mode_share
+        poses = joint_poses(
+            placed, pairs, judged.uncertain.part(of_town), p[of_town], judged.voxel_size
+        )
+        joint.increment[of_town] = poses.increment
+        joint.covariance[of_town] = poses.covariance
+    return p * position_confidence(joint.sigma, judged.voxel_size), joint
 
 
 def possible(judged: Judged) -> Bools:
@@ -194,10 +205,11 @@ def possible(judged: Judged) -> Bools:
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
     """The model of all towns; and the results of models that had not seen a town: ``alone`` and
-    ``probability`` (n,).
+    ``probability`` (n,), and the alignments ``judged`` with the poses that these give them.
     """
 
     model: Model
+    judged: Judged
     alone: F64
     probability: F64
 
@@ -228,11 +240,11 @@ def fit(judged: Judged) -> Fitted:
         votes = fit_votes(judged, agreement, others & kept, own)
         total[of_town] = own[of_town] + votes.log_odds(Votes.of(agreement.part(of_town)).vector())
     total = np.minimum(total, most)
-    p = np.where(kept, probability(judged, own, total), 0.0)
+    p, joint = probability(judged, own, total)
     most_alike = max_ambiguity(judged, agreement, np.where(kept, probability_of(total), 0.0))
     fitted = Model(model, fit_votes(judged, agreement, kept, own), most, most_alike)
-    p = np.where(fitted.is_ambiguous(agreement), 0.0, p)
-    return Fitted(fitted, probability_of(own), p)
+    p = np.where(kept & ~fitted.is_ambiguous(agreement), p, 0.0)
+    return Fitted(fitted, judged.with_poses(joint), probability_of(own), p)
 
 
 def _temper(held_out: F64, judged: Judged, rows: Bools) -> tuple[float, float]:

@@ -7,7 +7,7 @@ tables, and the report of the acceptance is made from them: neither needs a new 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.closures.acceptance.joint_poses import JointPoses, Uncertainty
 from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.alignment_tables import read_alignments
 from semloc_logs.closures.closure import FEATURES, Alignments, Features
@@ -29,31 +30,48 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Rows = Bools | NDArray[np.int64]
 
 COPIES = "repeating"  # in the names of towns of copied blocks
-OWN = ("error_m", "error_deg", "nees_position", "nees_pose")  # columns of a row by itself
+UNCERTAINTY = tuple(f.name for f in fields(Uncertainty))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
     """Alignments (n) of several towns: ``features`` (n,), where they lie (the caller sets the
-    probabilities there), whether they are ``right`` (n,), and their errors (n,) in metres and
-    degrees.
-
-    ``nees_position`` and ``nees_pose`` (n,) are the squares of the errors over their covariance, of
-    3 and of 6 degrees of freedom (Bar-Shalom et al., Estimation with Applications to Tracking and
-    Navigation, 2001, section 5.4).
+    probabilities there), how ``uncertain`` they are, whether they are ``right`` (n,), and their
+    errors (n, 6) in metres and radians, in the axes of the target.
     """
 
     town: NDArray[np.object_]
     features: Features[F64]
     placed: Placed
+    uncertain: Uncertainty
     right: Bools
-    error_m: F64
-    error_deg: F64
-    nees_position: F64
-    nees_pose: F64
+    error: F64
     voxel_size: float
+
+    @property
+    def error_m(self) -> F64:
+        """Errors of the positions (n,), metres."""
+        return np.asarray(np.linalg.norm(self.error[:, :3], axis=1))
+
+    @property
+    def error_deg(self) -> F64:
+        """Errors of the rotations (n,), degrees."""
+        return np.asarray(np.degrees(np.linalg.norm(self.error[:, 3:], axis=1)))
+
+    @property
+    def nees_position(self) -> F64:
+        """Squares (n,) of the errors over their covariance, of 3 degrees of freedom (Bar-Shalom et
+        al., Estimation with Applications to Tracking and Navigation, 2001, section 5.4).
+        """
+        return normalised_squares(self.error[:, :3], self.uncertain.covariance[:, :3, :3])
+
+    @property
+    def nees_pose(self) -> F64:
+        """The same of position and rotation (n,), of 6 degrees of freedom."""
+        return normalised_squares(self.error, self.uncertain.covariance)
 
     @property
     def clear(self) -> Bools:
@@ -70,12 +88,33 @@ class Judged:
     def __len__(self) -> int:
         return len(self.town)
 
-    def part(self, rows: Bools) -> Judged:
+    def part(self, rows: Rows) -> Judged:
         """Some of them."""
-        columns = {n: getattr(self, n)[rows] for n in ("town", "right", *OWN)}
         return replace(
-            self, features=self.features.part(rows), placed=self.placed.part(rows), **columns
+            self,
+            town=self.town[rows],
+            features=self.features.part(rows),
+            placed=self.placed.part(rows),
+            uncertain=self.uncertain.part(rows),
+            right=self.right[rows],
+            error=self.error[rows],
         )
+
+    def with_poses(self, joint: JointPoses) -> Judged:
+        """Judged anew with the poses that neighbours estimate together."""
+        error = self.error + joint.increment
+        return replace(
+            self,
+            uncertain=replace(self.uncertain, covariance=joint.covariance),
+            right=is_right(error),
+            error=error,
+        )
+
+
+def is_right(error: F64) -> Bools:
+    """Which errors (n, 6), in metres and radians, are within the bounds of right closures."""
+    position, rotation = np.linalg.norm(error.reshape(-1, 2, 3), axis=2).T
+    return np.asarray((position <= CORRECT_M) & (np.degrees(rotation) <= CORRECT_DEG))
 
 
 def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
@@ -83,7 +122,8 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
 
     Columns: the sessions, stamps, standard deviation and features of alignments, and town, query,
     road, target_road, own_* and at_* (the query in its own map by odometry, in the target's by
-    alignment), error_m, error_deg, nees_position, nees_pose, right; null without a true pose.
+    alignment), the fields of :class:`Uncertainty`, and error (6), error_m and right, which are null
+    without a true pose.
     """
     maps = {f.name: SessionMap(f) for f in work.sessions()}
     tracks = read_truth(truth, maps)
@@ -101,6 +141,7 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
         own[of_pair] = maps[query].map_T_base[ends[0]]
         map_T_query[of_pair] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[of_pair]
     query_session, target_session = rows.sessions()
+    uncertain = Uncertainty.of(rows, maps)
     columns: dict[str, Any] = {
         "query_session": query_session.tolist(),
         "target_session": target_session.tolist(),
@@ -112,6 +153,7 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
         "query": rows.query_keyframe,
         "road": road,
         "target_road": target_road,
+        **{name: _lists(getattr(uncertain, name)) for name in UNCERTAINTY},
         **_errors(rows, tracks),
     }
     columns |= {f"own_{i}{j}": own[:, i, j] for i in range(3) for j in range(4)} | {
@@ -140,16 +182,17 @@ def _errors(rows: Alignments, tracks: Mapping[str, TrueTrack]) -> dict[str, pa.A
         turned = measured[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)
         error[of_pair, 3:] = Rotation.from_matrix(turned).as_rotvec()
 
-    error_m = np.linalg.norm(error[:, :3], axis=1)
-    error_deg = np.degrees(np.linalg.norm(error[:, 3:], axis=1))
-    values = {
-        "error_m": error_m,
-        "error_deg": error_deg,
-        "nees_position": normalised_squares(error[:, :3], rows.covariance[:, :3, :3]),
-        "nees_pose": normalised_squares(error, rows.covariance),
-        "right": (error_m <= CORRECT_M) & (error_deg <= CORRECT_DEG),
+    return {
+        "error": _lists(error),
+        "error_m": pa.array(np.linalg.norm(error[:, :3], axis=1), mask=~known),
+        "right": pa.array(is_right(error), mask=~known),
     }
-    return {name: pa.array(value, mask=~known) for name, value in values.items()}
+
+
+def _lists(values: F64) -> pa.Array:
+    """Values (n, ...) as a column of lists of one length."""
+    flat = values.reshape(len(values), -1)
+    return pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), flat.shape[1])
 
 
 def normalised_squares(errors: F64, covariance: F64) -> F64:
@@ -166,15 +209,19 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         raise WorkspaceError("No town was judged yet: run 'collect' first.")
     tables = [read_table(path) for path in paths]
     for path, held in zip(paths, tables, strict=True):
-        if not set(OWN) <= set(held.column_names):
+        if not {"error", *UNCERTAINTY} <= set(held.column_names):
             raise WorkspaceError(f"{path} is of another version: remove it and collect again.")
     table = pa.concat_tables(tables)
     table = table.filter(table["right"].is_valid())
     column = {
         name: table[name].to_numpy()
         for name in table.column_names
-        if name not in ("town", "query_session", "target_session")
+        if name not in ("town", "query_session", "target_session", "error", *UNCERTAINTY)
     }
+
+    def lists(name: str, *shape: int) -> F64:
+        flat = table[name].combine_chunks().flatten().to_numpy()
+        return np.asarray(flat.reshape(len(table), *shape))
 
     def poses(prefix: str) -> F64:
         out = np.tile(np.eye(4), (len(table), 1, 1))
@@ -199,8 +246,17 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         np.full(len(table), np.nan),
         np.ones(len(table), bool),
     )
-    right = column["right"].astype(bool)
-    features = Features(*(column[n] for n in FEATURES))
-    own = {name: column[name] for name in OWN}
-    voxel_size = float(read_metadata(paths[0])["voxel_size"])
-    return Judged(names["town"], features, placed, right, voxel_size=voxel_size, **own)
+    return Judged(
+        names["town"],
+        Features(*(column[n] for n in FEATURES)),
+        placed,
+        Uncertainty(
+            lists("covariance", 6, 6),
+            lists("map_R_target", 3, 3),
+            lists("query_drift", 6),
+            lists("target_drift", 6),
+        ),
+        column["right"].astype(bool),
+        lists("error", 6),
+        float(read_metadata(paths[0])["voxel_size"]),
+    )

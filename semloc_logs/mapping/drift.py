@@ -31,13 +31,18 @@ class Drift:
         return cls((x, y, z), (roll, pitch, yaw))
 
     @property
+    def rates(self) -> F64:
+        """Of the translation and of the rotation (6,)."""
+        return np.array([*self.translation, *self.rotation])
+
+    @property
     def percent(self) -> float:
         """The greatest part of the translation, in percent of the way."""
         return 100 * max(self.translation)
 
     def covariance(self, road: float) -> F64:
         """Covariance (6, 6) of a motion over ``road`` metres, in the axes of the base."""
-        return np.diag((road * np.array([*self.translation, *self.rotation])) ** 2)
+        return np.diag((road * self.rates) ** 2)
 
     def to_json(self) -> dict[str, list[float]]:
         """For session.json."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from semloc_logs.closures.acceptance.joint_poses import Uncertainty
 from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.closure import Features
 from semloc_logs.evaluation.judged_alignments import Judged
@@ -47,8 +48,14 @@ def _judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
         np.zeros(n),
         np.ones(n, bool),
     )
-    error = np.where(right, 0.1, 50.0)
-    nees = np.where(right, 3.0, 1e6)
-    return Judged(
-        town, Features(*features.T), placed, right, error, np.zeros(n), nees, 2 * nees, 0.3
-    )
+    # 3 and 6 as the squares over the covariances
+    error = np.where(right, 0.02, 50.0)[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    error[right, 3:] = 0.002
+    return Judged(town, Features(*features.T), placed, uncertain(n), right, error, 0.3)
+
+
+def uncertain(n: int) -> Uncertainty:
+    """Standard deviations of 2 cm and 2 mrad; odometry without drift."""
+    covariance = np.diag([0.02**2] * 3 + [0.002**2] * 3)
+    axes = np.tile(np.eye(3), (n, 1, 1))
+    return Uncertainty(np.tile(covariance, (n, 1, 1)), axes, np.zeros((n, 6)), np.zeros((n, 6)))

@@ -15,6 +15,7 @@ from semloc_logs.evaluation.acceptance_report import closures_at, reliability
 from semloc_logs.evaluation.calibration_fit import calibration_json, fit, fit_signed
 from semloc_logs.evaluation.judged_alignments import Judged
 from semloc_logs.numerics.transforms import yaw_transform
+from tests.evaluation.conftest import uncertain
 
 Make = Callable[..., Judged]
 
@@ -73,15 +74,14 @@ def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere(judged: 
         f.name: np.concatenate([getattr(data.placed, f.name), getattr(placed, f.name)])
         for f in fields(Placed)
     }
+    error = np.where(copy, 85.0, 0.02)[:, None] * np.eye(6)[0]
     both = Judged(
         np.concatenate([data.town, town]),
         Features(*np.concatenate([data.features.vector(), features]).T),
         Placed(**poses),
+        uncertain(len(data) + n),
         np.concatenate([data.right, ~copy]),
-        np.concatenate([data.error_m, np.where(copy, 85.0, 0.1)]),
-        np.zeros(len(data) + n),
-        np.ones(len(data) + n),
-        np.ones(len(data) + n),
+        np.concatenate([data.error, error]),
         0.3,
     )
     fitted = fit(both)

@@ -15,6 +15,7 @@ from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation import judged_alignments
 from semloc_logs.evaluation.judged_alignments import judge_town, normalised_squares, read_judged
+from semloc_logs.mapping.drift import UNMEASURED
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.tables import contracts
@@ -53,6 +54,7 @@ def judge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         distance=2.0 * np.arange(5),
         stamps_ns=np.arange(5) * 10**9,
         folder=None,
+        drift=UNMEASURED,
     )
     for name in "ab":
         (tmp_path / f"{name}.tum").write_text(
@@ -114,7 +116,7 @@ def test_tables_that_are_missing_or_of_another_version_are_named(
         read_judged([])
     table = judge(alignment(inverse(ROAD[2]) @ ROAD[1]))
     old = tmp_path / "old.parquet"
-    write_table(old, read_table(table).drop_columns(["nees_pose"]), {"voxel_size": 0.3})
+    write_table(old, read_table(table).drop_columns(["covariance"]), {"voxel_size": 0.3})
     with pytest.raises(WorkspaceError, match=r"old\.parquet is of another version"):
         read_judged([table, old])
 

@@ -123,6 +123,18 @@ def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> lis
 
 
 @njit(cache=True, nogil=True)
+def most_apart(sigma: F64, other_sigma: F64, road: F64, target_road: F64, voxel_size: float) -> F64:
+    """Metres by which two alignments that agree may differ: floats or arrays (n,).
+
+    Their positions have the standard deviations ``sigma`` and ``other_sigma``; ``road`` and
+    ``target_road`` metres lie between them in the two sessions.
+    """
+    slack = SLACK * voxel_size + 2 * np.hypot(sigma, other_sigma)
+    drift = ODOMETRY_DRIFT * (road + target_road) + ARM * road
+    return np.minimum(slack, MOST_SLACK * voxel_size) + drift
+
+
+@njit(cache=True, nogil=True)
 def _add_votes(
     out: F64,
     group: tuple[I64, F64, F64, F64, F64],
@@ -144,19 +156,13 @@ def _add_votes(
         for n in range(first[k], end[k]):
             if voter_query[n] != query[k]:
                 along = abs(voter_road[n] - road[k])
-                drift = (
-                    ODOMETRY_DRIFT * (along + abs(voter_target_road[n] - target_road[k]))
-                    + ARM * along
-                )
-                slack = min(
-                    SLACK * voxel_size + 2 * np.hypot(sigma[k], voter_sigma[n]),
-                    MOST_SLACK * voxel_size,
-                )
+                target_along = abs(voter_target_road[n] - target_road[k])
+                most = most_apart(sigma[k], voter_sigma[n], along, target_along, voxel_size)
                 agrees = _agrees(
                     target_T_map[k],
                     map_T_query[n],
                     target_T_query[n],
-                    slack + drift,
+                    float(most),
                     TURN + TURN_DRIFT * along / scale,
                 )
                 for i in range(len(p)):

@@ -16,6 +16,7 @@ from semloc_logs.closures.acceptance.calibration import (
     shipped,
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
+from semloc_logs.closures.acceptance.joint_poses import JointPoses, Uncertainty, joint_poses
 from semloc_logs.closures.acceptance.placements import (
     F64,
     I64,
@@ -73,9 +74,12 @@ def decide(
     roads = query_roads(placed)
     for name, keyframes in (queries or {}).items():
         roads[name] = maps[name].distance[np.asarray(keyframes, int)]
-    agreement, decisions = _decisions(rows, placed, roads, model, settings.fusion.voxel_size)
+    uncertainty = Uncertainty.of(rows, maps)
+    agreement, decisions, joint = _decisions(
+        rows, placed, uncertainty, roads, model, settings.fusion.voxel_size
+    )
     outcomes = Outcomes(
-        rows,
+        joint.of(rows),
         decisions,
         agreement,
         settings.closures.min_probability,
@@ -100,26 +104,34 @@ def _is_first(rows: Alignments, order: I64) -> Bools:
 
 
 def _decisions(
-    rows: Alignments, placed: Placed, roads: Mapping[str, F64], model: Model, voxel_size: float
-) -> tuple[Agreement[F64], Decisions]:
-    """The votes on each alignment (n,), its factors and its vetoes."""
+    rows: Alignments,
+    placed: Placed,
+    uncertainty: Uncertainty,
+    roads: Mapping[str, F64],
+    model: Model,
+    voxel_size: float,
+) -> tuple[Agreement[F64], Decisions, JointPoses]:
+    """The votes on each alignment (n,), its factors and its vetoes, and its pose."""
     pairs = pairs_of(placed)
     own = place_odds(placed, pairs, placed.log_odds, voxel_size)
     agreement = count_votes(placed, pairs, own.share, voxel_size, roads)
     with_votes = place_odds(placed, pairs, model.log_odds(placed.log_odds, agreement), voxel_size)
+    # neighbours tell which place is right, and share its errors: not which pose in it
+    mode_share = own.mode_share
+    place_probability = with_votes.place_probability
+    joint = joint_poses(placed, pairs, uncertainty, place_probability * mode_share, voxel_size)
     vetoes = {
         Veto.CONTRADICTS_ODOMETRY: contradicts_odometry(placed, voxel_size),
         Veto.AMBIGUOUS_PLACE: model.is_ambiguous(agreement),
         Veto.LOOSE_FIT: is_loose(rows.features),
     }
     decisions = Decisions(
-        with_votes.place_probability,
-        # neighbours tell which place is right, and share its errors: not which pose in it
-        own.mode_share,
-        position_confidence(placed.sigma, voxel_size),
+        place_probability,
+        mode_share,
+        position_confidence(joint.sigma, voxel_size),
         np.stack([vetoes[veto] for veto in Veto], axis=1),
     )
-    return agreement, decisions
+    return agreement, decisions, joint
 
 
 def why_rejected(decision: Decision, features: Features[float], model: Model) -> Reason:

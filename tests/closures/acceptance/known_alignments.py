@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.closures.acceptance.calibration import Calibration, Model, log_odds
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment, Closure, Features, Rejected
+from semloc_logs.mapping.drift import UNMEASURED
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import Settings
@@ -42,7 +43,12 @@ def bend(n: int, step: float = 2.0) -> F64:
 def session(poses: F64, posed: bool = True) -> SessionMap:
     return cast(
         SessionMap,
-        SimpleNamespace(map_T_base=poses, distance=2.0 * np.arange(len(poses)), posed=posed),
+        SimpleNamespace(
+            map_T_base=poses,
+            distance=2.0 * np.arange(len(poses)),
+            posed=posed,
+            drift=UNMEASURED,
+        ),
     )
 
 

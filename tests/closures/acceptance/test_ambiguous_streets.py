@@ -11,6 +11,7 @@ import pytest
 
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment
+from semloc_logs.mapping.drift import UNMEASURED
 from semloc_logs.mapping.session_map import SessionMap
 from tests.closures.acceptance.known_alignments import (
     COPIED,
@@ -68,6 +69,7 @@ def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
     twice = SimpleNamespace(
         map_T_base=np.tile(STRAIGHT, (2, 1, 1)),
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
+        drift=UNMEASURED,
     )
     rows = [in_street(k, target_keyframe) for k in COPIED for target_keyframe in (k, 100 + k + 12)]
     outcomes = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, model=MODEL)

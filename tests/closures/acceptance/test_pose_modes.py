@@ -13,6 +13,7 @@ from semloc_logs.closures.acceptance.consistency import place_odds
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.acceptance.placements import pairs_of, place
 from semloc_logs.closures.closure import Alignment
+from semloc_logs.mapping.drift import UNMEASURED
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from tests.closures.acceptance.known_alignments import (
@@ -48,6 +49,7 @@ def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None
         map_T_base=np.tile(MAPS["b"].map_T_base, (2, 1, 1)),
         distance=np.r_[MAPS["b"].distance, 500.0 + MAPS["b"].distance],
         posed=True,
+        drift=UNMEASURED,
     )
     maps = {**MAPS, "b": cast(SessionMap, twice)}
     again = dataclasses.replace(
