@@ -38,9 +38,10 @@ ROWS_AT_ONCE = 1000  # alignments whose neighbours are in memory together
 class Uncertainty(Columns):
     """How uncertain alignments (n) are, and the odometry beside them.
 
-    ``covariance`` (n, 6, 6) is of target_T_query in the axes of the target's keyframe, which
-    ``map_R_target`` (n, 3, 3) takes into the axes of its map. ``query_drift`` and ``target_drift`` (n,
-    6) are standard deviations of a metre of road in the two sessions, in metres and radians.
+    ``covariance`` (n, 6, 6) is of target_T_query in the axes of the target's keyframe;
+    ``map_R_target`` (n, 3, 3) takes these into the axes of its map. ``query_drift`` and
+    ``target_drift`` (n, 6) are standard deviations of a metre of road in the two sessions, in
+    metres and radians.
     """
 
     covariance: F64
