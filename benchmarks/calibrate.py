@@ -4,12 +4,14 @@ seen.
     python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]
     python benchmarks/calibrate.py fit DIR [--install]
     python benchmarks/calibrate.py report DIR...
+    python benchmarks/calibrate.py parts DIR...
 
 Collecting simulates, queries and judges, and resumes; fitting takes seconds. Collecting writes
 DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; the others read
 these alone. Fitting writes DIR/calibration.json, and the report of models that had not seen a town:
 DIR/acceptance.md, DIR/acceptance.json and DIR/reliability.png. --install also replaces the
-calibration of the package. The report of the package's own calibration goes to the terminal.
+calibration of the package. The report of the package's own calibration goes to the terminal, as
+does a table of closures where one part of the acceptance is left out.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.acceptance_report import reliability, report_of
 from semloc_logs.evaluation.calibration_fit import calibration_json, decided_by, fit
+from semloc_logs.evaluation.decision_parts import parts_markdown
 from semloc_logs.evaluation.judged_alignments import Judged, read_judged
 from semloc_logs.pictures.reliability_diagram import draw_reliability
 
@@ -162,6 +165,11 @@ def report(args: argparse.Namespace) -> None:
     print(report_of(*decided_by(shipped(), judged)).markdown())
 
 
+def parts(args: argparse.Namespace) -> None:
+    """Print what each part of the acceptance does."""
+    print(parts_markdown(judged_towns(args.dirs)))
+
+
 def judged_towns(folders: Sequence[Path]) -> Judged:
     """The judged alignments of all towns of some folders."""
     return read_judged(sorted(p for folder in folders for p in folder.glob("*/judged.parquet")))
@@ -190,6 +198,9 @@ def main() -> None:
     third = commands.add_parser("report")
     third.add_argument("dirs", type=Path, nargs="+", metavar="DIR")
     third.set_defaults(run=report)
+    fourth = commands.add_parser("parts")
+    fourth.add_argument("dirs", type=Path, nargs="+", metavar="DIR")
+    fourth.set_defaults(run=parts)
     args = parser.parse_args()
     args.run(args)
 

@@ -30,7 +30,7 @@ from semloc_logs.closures.acceptance.calibration import (
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
 from semloc_logs.closures.acceptance.joint_poses import JointPoses, joint_poses
 from semloc_logs.closures.acceptance.placements import contradicts_odometry, pairs_of
-from semloc_logs.closures.closure import Agreement
+from semloc_logs.closures.closure import Agreement, Veto
 from semloc_logs.evaluation.acceptance_report import SURE
 from semloc_logs.evaluation.judged_alignments import Judged
 
@@ -88,7 +88,7 @@ def fit_signed(
     return Calibration(columns[0], columns[1], columns[2], columns[3], bias)
 
 
-def fit_alone(judged: Judged, rows: Bools) -> Calibration:
+def fit_alone(judged: Judged, rows: Bools, signs: Sequence[int] = SIGNS) -> Calibration:
     """The model of an alignment's own features, from the clear ones among ``rows`` (n,).
 
     An alignment looks the same in each copy of a block, so nothing of its own can tell them apart:
@@ -96,7 +96,7 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
     """
     rows = rows & judged.clear & ~judged.copies
     values = Evidence.of(judged.features.part(rows)).vector()
-    return fit_signed(values, judged.right[rows], SIGNS)
+    return fit_signed(values, judged.right[rows], signs)
 
 
 def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) -> Calibration:
@@ -164,69 +164,105 @@ def _held_out(judged: Judged) -> Iterator[tuple[NDArray[np.int64], Bools]]:
         yield of_town, others
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Factors:
+    """The factors of the probability of alignments (n,), and the poses that they are of."""
+
+    place: F64
+    mode_share: F64
+    position: F64
+    poses: JointPoses
+
+    @property
+    def probability(self) -> F64:
+        """Their product (n,)."""
+        return self.place * self.mode_share * self.position
+
+    @classmethod
+    def of(cls, judged: Judged, own: F64, with_votes: F64) -> Factors:
+        """Of log-odds ``own`` and ``with_votes`` (n,)."""
+        place, mode_share = np.zeros((2, len(judged)))
+        poses = JointPoses(np.zeros_like(judged.error), judged.uncertain.covariance.copy())
+        for of_town in _towns(judged):
+            placed = judged.placed.part(of_town)
+            uncertain = judged.uncertain.part(of_town)
+            pairs = pairs_of(placed)
+            size = judged.voxel_size
+            odds = place_odds(placed, pairs, with_votes[of_town], size)
+            place[of_town] = odds.place_probability
+            mode_share[of_town] = place_odds(placed, pairs, own[of_town], size).mode_share
+            probability = (place * mode_share)[of_town]
+            joint = joint_poses(placed, pairs, uncertain, probability, size)
+            poses.increment[of_town] = joint.increment
+            poses.covariance[of_town] = joint.covariance
+        position = position_confidence(poses.sigma, judged.voxel_size)
+        return cls(place, mode_share, position, poses)
+
+
+def vetoes_of(judged: Judged, model: Model, agreement: Agreement[F64]) -> dict[Veto, Bools]:
+    """Which alignments (n,) have each veto."""
+    return {
+        Veto.CONTRADICTS_ODOMETRY: contradicts_odometry(judged.placed, judged.voxel_size),
+        Veto.AMBIGUOUS_PLACE: model.is_ambiguous(agreement),
+        Veto.LOOSE_FIT: is_loose(judged.features),
+    }
+
+
 def decided_by(model: Model, judged: Judged) -> tuple[Judged, F64]:
     """The alignments with the poses that the acceptance gives them with ``model``, and their
     probabilities (n,), 0 where there is a veto.
     """
     own = model.own_log_odds(judged.features)
     agreement = agreement_of(judged, own)
-    p, joint = probability(judged, own, model.log_odds(own, agreement))
-    vetoed = model.is_ambiguous(agreement) | ~possible(judged)
-    return judged.with_poses(joint), np.where(vetoed, 0.0, p)
-
-
-def probability(judged: Judged, own: F64, with_votes: F64) -> tuple[F64, JointPoses]:
-    """The product of the factors (n,), of log-odds ``own`` and ``with_votes`` (n,), and the poses
-    of which it is.
-    """
-    p = np.zeros(len(judged))
-    joint = JointPoses(np.zeros_like(judged.error), judged.uncertain.covariance.copy())
-    for of_town in _towns(judged):
-        placed = judged.placed.part(of_town)
-        pairs = pairs_of(placed)
-        total = place_odds(placed, pairs, with_votes[of_town], judged.voxel_size)
-        mode_share = place_odds(placed, pairs, own[of_town], judged.voxel_size).mode_share
-        p[of_town] = total.place_probability * mode_share
-        poses = joint_poses(
-            placed, pairs, judged.uncertain.part(of_town), p[of_town], judged.voxel_size
-        )
-        joint.increment[of_town] = poses.increment
-        joint.covariance[of_town] = poses.covariance
-    return p * position_confidence(joint.sigma, judged.voxel_size), joint
-
-
-def possible(judged: Judged) -> Bools:
-    """Which alignments (n,) have no veto of their own."""
-    return np.asarray(
-        ~contradicts_odometry(judged.placed, judged.voxel_size) & ~is_loose(judged.features)
-    )
+    factors = Factors.of(judged, own, model.log_odds(own, agreement))
+    vetoed = np.any([*vetoes_of(judged, model, agreement).values()], axis=0)
+    return judged.with_poses(factors.poses), np.where(vetoed, 0.0, factors.probability)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """The model of all towns; and the results of models that had not seen a town: ``alone`` and
-    ``probability`` (n,), and the alignments ``judged`` with the poses that these give them.
+    """The model of all towns; and the results of models that had not seen a town: log-odds ``own``
+    and ``with_votes`` (n,), the factors and vetoes that follow, and the alignments ``judged`` with
+    the poses that these give them.
     """
 
     model: Model
     judged: Judged
-    alone: F64
-    probability: F64
+    own: F64
+    with_votes: F64
+    factors: Factors
+    vetoes: dict[Veto, Bools]
+
+    @property
+    def alone(self) -> F64:
+        """The probability (n,) of an alignment by itself."""
+        return probability_of(self.own)
+
+    @property
+    def vetoed(self) -> Bools:
+        """Which have a veto (n,)."""
+        return np.asarray(np.any([*self.vetoes.values()], axis=0))
+
+    @property
+    def probability(self) -> F64:
+        """What the acceptance gives (n,)."""
+        return np.where(self.vetoed, 0.0, self.factors.probability)
 
 
-def fit(judged: Judged) -> Fitted:
+def fit(judged: Judged, signs: Sequence[int] = SIGNS) -> Fitted:
     """Fit all models, and each of them without each town in turn.
 
-    The model of the votes learns from log-odds on towns that the model alone had not seen. Where
-    held-out log-odds turn out too sure (Platt, Probabilistic outputs for support vector machines,
-    1999), the first is tempered.
+    ``signs`` are the ones with which evidence may count, 0 where it is left out. The model of the
+    votes learns from log-odds on towns that the model alone had not seen. Where held-out log-odds
+    turn out too sure (Platt, Probabilistic outputs for support vector machines, 1999), the first is
+    tempered.
     """
-    kept = possible(judged)
+    kept = ~contradicts_odometry(judged.placed, judged.voxel_size) & ~is_loose(judged.features)
     own = np.zeros(len(judged))
     for of_town, others in _held_out(judged):
         unseen = Evidence.of(judged.features.part(of_town)).vector()
-        own[of_town] = fit_alone(judged, others & kept).log_odds(unseen)
-    whole = fit_alone(judged, kept)
+        own[of_town] = fit_alone(judged, others & kept, signs).log_odds(unseen)
+    whole = fit_alone(judged, kept, signs)
     scale, shift = _temper(own, judged, kept)
     most = float(np.log(judged.clear.sum()))
     own = np.minimum(scale * own + shift, most)
@@ -240,11 +276,11 @@ def fit(judged: Judged) -> Fitted:
         votes = fit_votes(judged, agreement, others & kept, own)
         total[of_town] = own[of_town] + votes.log_odds(Votes.of(agreement.part(of_town)).vector())
     total = np.minimum(total, most)
-    p, joint = probability(judged, own, total)
     most_alike = max_ambiguity(judged, agreement, np.where(kept, probability_of(total), 0.0))
     fitted = Model(model, fit_votes(judged, agreement, kept, own), most, most_alike)
-    p = np.where(kept & ~fitted.is_ambiguous(agreement), p, 0.0)
-    return Fitted(fitted, judged.with_poses(joint), probability_of(own), p)
+    factors = Factors.of(judged, own, total)
+    vetoes = vetoes_of(judged, fitted, agreement)
+    return Fitted(fitted, judged.with_poses(factors.poses), own, total, factors, vetoes)
 
 
 def _temper(held_out: F64, judged: Judged, rows: Bools) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.closure import Features
 from semloc_logs.evaluation.acceptance_report import closures_at, reliability
 from semloc_logs.evaluation.calibration_fit import calibration_json, fit, fit_signed
+from semloc_logs.evaluation.decision_parts import parts_markdown, without_parts
 from semloc_logs.evaluation.judged_alignments import Judged
 from semloc_logs.numerics.transforms import yaw_transform
 from tests.evaluation.conftest import uncertain
@@ -115,3 +116,46 @@ def test_weights_of_the_wrong_sign_are_left_out() -> None:
     right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * x[:, 0] - 1.0 * x[:, 1] + 0.3)))
     assert fit_signed(x, right, (1, -1, 0)).weights == pytest.approx((1.5, -1.0, 0.0), abs=0.15)
     assert fit_signed(x, right, (1, 1, 0)).weights[1:] == (0.0, 0.0)
+
+
+def test_of_every_part_of_the_acceptance_there_is_a_row_without_it(judged: Make) -> None:
+    """In these towns the contradiction and the neighbours alone tell."""
+    data = judged()
+    rows = {name: closures_at(j, p, (0.99,))[0] for name, j, p in without_parts(data)}
+    assert list(rows)[:4] == ["nothing", *(f"`{name}`" for name in EVIDENCE)]
+    whole = rows["nothing"]
+    assert whole == closures_at(fit(data).judged, fit(data).probability, (0.99,))[0]
+    for name in ("`log_contradiction`", "votes of neighbours"):
+        assert rows[name].accepted < 0.9 * whole.accepted
+    assert rows["the position"] == whole
+    table = parts_markdown(data).splitlines()
+    assert table[0] == "| left out | drives, ordinary towns |"
+    assert table[2] == f"| nothing | {whole.accepted - whole.false} of {whole.possible}, " + (
+        f"{whole.false} |"
+    )
+    assert len(table) == 2 + len(rows)
+
+
+def test_a_veto_that_is_left_out_does_not_reject(judged: Make) -> None:
+    """Every second alignment is not held by its points."""
+    data = judged()
+    loose = np.arange(len(data)) % 2 == 1
+    fit_share = np.where(loose, 0.1, 0.5)
+    stiffness = np.where(loose, 0.2, 2.0)
+    features = replace(data.features, fit=fit_share, stiffness=stiffness)
+    p = {name: p for name, _, p in without_parts(replace(data, features=features))}
+    assert p["nothing"][loose].max() == p["the veto of ambiguous places"][loose].max() == 0.0
+    assert p["the veto of loose fits"][loose].max() > 0.5
+
+
+def test_neighbours_and_the_position_take_from_an_uncertain_pose(judged: Make) -> None:
+    """0.4 m alone, which neighbours halve."""
+    data = judged()
+    covariance = 400 * data.uncertain.covariance
+    uncertain_poses = replace(
+        data,
+        uncertain=replace(data.uncertain, covariance=covariance),
+        placed=replace(data.placed, sigma=np.full(len(data), 0.4)),
+    )
+    p = {name: p[data.right] for name, _, p in without_parts(uncertain_poses)}
+    assert p["poses of neighbours"].max() < p["nothing"].max() < p["the position"].max()

@@ -234,7 +234,7 @@ def test_errors_of_neighbours_average() -> None:
 
 
 def test_alignments_get_the_poses_in_the_axes_of_their_target() -> None:
-    """The target looks along y of its map: what is off along x there is off along -y of it."""
+    """The target looks along y of its map: an increment along its x is one along -y of the map."""
     rows = Alignments.of([alignment(20, 0.9), alignment(21, 0.9)])
     beside = Uncertainty.of(rows, MAPS)
     np.testing.assert_array_equal(beside.map_R_target[1], MAPS["b"].map_T_base[21, :3, :3])
