@@ -32,8 +32,9 @@ NAMES_OF_VETOES = {
 
 
 def without_parts(judged: Judged) -> Iterator[tuple[str, Judged, F64]]:
-    """The name of what is left out, the alignments with their poses, and their probabilities (n,)
-    without it. The first is without nothing.
+    """The part that is left out, the alignments with their poses, and their probabilities (n,).
+
+    The first is without nothing.
     """
     fitted = fit(judged)
     factors = fitted.factors
@@ -71,7 +72,7 @@ def parts_markdown(judged: Judged) -> str:
         cells = [name]
         for kind in columns:
             rows = kinds == kind
-            [at] = closures_at(decided.part(rows), p[rows], (SURE,))
-            cells.append(f"{at.accepted - at.false} of {at.possible}, {at.false}")
+            [counts] = closures_at(decided.part(rows), p[rows], (SURE,))
+            cells.append(f"{counts.accepted - counts.false} of {counts.possible}, {counts.false}")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
