@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.poses.track import PoseTrack
@@ -37,7 +37,6 @@ from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.settings import Labels, load
 
-F64 = NDArray[np.float64]
 SIZES: dict[str, Sequence[float]] = {
     "clock offset (s)": (0.02, 0.05, 0.1, 0.2, 0.4, 0.8),
     "lever arm (m)": (0.1, 0.2, 0.5, 1.0, 2.0),

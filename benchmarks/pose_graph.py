@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.evaluation.trajectory_errors import aligned_distances, relative_errors, rms
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
@@ -27,7 +27,6 @@ from semloc_logs.pose_graph.optimisation import optimise_graph
 from semloc_logs.settings import load
 from semloc_logs.simulation.drives.trajectory import drifting_odometry
 
-F64 = NDArray[np.float64]
 KEYFRAME_M = 4.0
 DRIFT = 0.01
 SIGMA_M = 0.05

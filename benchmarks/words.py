@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, I64
 from semloc_logs.subvolumes.cut import code_table
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.network import Encoder, descriptors
@@ -31,9 +32,6 @@ NEAREST = 5
 BLOCK = 250  # queries that are compared with the whole database at once
 BATCH = 16  # views that are described at once
 EVERYTHING = Allowed(np.ones(1, bool))
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

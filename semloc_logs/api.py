@@ -20,8 +20,8 @@ from typing import Any, Literal, overload
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.evaluation.truth import Evaluation, evaluate_closures
@@ -48,7 +48,6 @@ from semloc_logs.tables.table import read_table
 from semloc_logs.workspace import SessionFolder
 from semloc_logs.workspace import Workspace as Folder
 
-F64 = NDArray[np.float64]
 PathLike = str | Path
 Logs = Sequence[PathLike] | Mapping[str, PathLike | Sequence[PathLike]]
 EngineName = Literal["serial", "processes", "dask"]

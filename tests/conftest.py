@@ -9,10 +9,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
 # small arrays: a second thread costs more than it brings, and much more on a busy machine
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# the first call of a compiled function compiles it, and other jobs may keep the machine busy
+settings.register_profile("semloc", deadline=None)
+settings.load_profile("semloc")
 # `python -m pytest` in the repository root would find the checkout's semloc_logs, which has no cli
 # and no schemas inside
 sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != ROOT]

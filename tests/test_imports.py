@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # rooms in the order of the story; a room imports only rooms above it
 ORDER = [
     "errors",
+    "arrays",
     "progress",
     "schemas",
     "settings",

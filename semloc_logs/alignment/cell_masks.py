@@ -17,20 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.tau import CUBE, closest_in_cube, cube_offsets
+from semloc_logs.arrays import F64, I32, I64, U8, U32, U64
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.numerics.bits import lowest_bit
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
 
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
-U64 = NDArray[np.uint64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 CLASSES = 29  # class ids that have bits of their own; the paper has 19
 UNLABELLED_BIT = 29
 NOT_ALIGNED = np.uint32(1 << 31)  # free space, or nothing within kappa

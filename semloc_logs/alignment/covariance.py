@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import SAME_PLACE_DEGREES, SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.drift import UNMEASURED, Drift
 from semloc_logs.numerics.transforms import inverse
 
-F64 = NDArray[np.float64]
 NORMAL_NOISE = np.radians(2.0)  # of tangent planes
 LEAST_NOISE = 0.02  # m: of plane distances
 UNKNOWN_NOISE = 1.0  # m: of a fit without points

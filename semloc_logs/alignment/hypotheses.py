@@ -9,10 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 # two alignments of a query with one target are the same place to within so many voxels and degrees
 # (docs/reference/truth.md: a right closure is within 1 m at voxels of 0.30 m, and 5 degrees)
 SAME_PLACE_VOXELS = 3.3

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.surface import Arrays, Surface, look_at, nearest_points
+from semloc_logs.arrays import F64, I64
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Pair = tuple[float, float]
 LEAST_POINTS = 12  # that an alignment needs
 KERNEL = 0.15  # of the robust weights, in units of the radius

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import KERNEL
 from semloc_logs.alignment.surface import Surface, look_at, nearest_points
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply
 
-F64 = NDArray[np.float64]
 STRIDE = 3  # of the points that are looked at, which stand for all
 LEVEL = 0.9  # of the normal's height on level ground
 LEAST_POINTS = 30

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8
 from semloc_logs.numerics.bits import EACH_BYTE, bytes_set
 from semloc_logs.voxels.grid import EIGHTS, FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
@@ -26,9 +27,6 @@ HIGHEST = np.uint64(FREE_BIT * EACH_BYTE)  # bit of each byte of a word
 # and blocks begin at whole eights
 REACH = 4
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Arrays = tuple[U8, F64, float]  # of a grid, in the order of its fields
 
 

@@ -24,12 +24,8 @@ from semloc_logs.alignment.cell_masks import (
     look_up,
     state_at,
 )
+from semloc_logs.arrays import F64, I32, I64, U8, U32
 
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 CHUNK = 512  # voxels counted between two checks whether a hypothesis can be among the best
 
 

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.mask_grid import MaskGrid, build_mask_grid, wanted_bits
+from semloc_logs.arrays import F64, U8
 from semloc_logs.labels.space import GROUND, cityscapes
 from semloc_logs.voxels.grid import BlockMap
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 SEARCH_VOXELS = 1200  # of a query that a search looks up, at most
 STRUCTURE_SHARE = 0.75  # of the score; the ground has the rest, to hold the height
 VIEW_AHEAD = 20.0  # voxels between a sensor and the mean of its points if it looks one way

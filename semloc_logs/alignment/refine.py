@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import pose_matrix
 from semloc_logs.alignment.icp import Fit, Step, Weighting, align
@@ -22,8 +21,8 @@ from semloc_logs.alignment.target_map import (
     Target,
     is_uncertain,
 )
+from semloc_logs.arrays import F64
 
-F64 = NDArray[np.float64]
 FINE_POINTS = 6000  # of a query in a fine fit; the acceptance's stiffness counts them
 COARSE_POINTS = 1000
 COARSE_ITERATIONS = 4

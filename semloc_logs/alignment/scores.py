@@ -10,15 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.mask_grid import FREE_BIT, Arrays, MaskGrid
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.arrays import F64, U8
 from semloc_logs.numerics.transforms import inverse
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 DOUBT = 150  # voxels that are added to the observed ones, and their shares in wrong poses
 DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.2
 # of the structure of both sides, in free space: less in most right poses, more in most wrong ones

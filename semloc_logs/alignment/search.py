@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import (
     SAME_PLACE_VOXELS,
@@ -19,10 +18,8 @@ from semloc_logs.alignment.mask_grid import FREE_BIT, REACH, Arrays, MaskGrid
 from semloc_logs.alignment.query_map import SEARCH_VOXELS, STRUCTURE_SHARE, Evidence, Query
 from semloc_logs.alignment.scores import mutual_scores
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.arrays import F64, I64, U8
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Voxels = tuple[F64, U8, int]  # of Evidence, in the order of its fields
 Cells = tuple[I64, U8]  # flat cells of the grid that voxels lie in, and the voxels' bits
 CHUNK = 128  # voxels counted between two checks whether the shift can be the best

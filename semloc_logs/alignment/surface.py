@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I32, I64
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.cells import by_cell
 from semloc_logs.numerics.local_shape import (
@@ -22,9 +23,6 @@ from semloc_logs.numerics.local_shape import (
     shapes_of,
 )
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-I32 = NDArray[np.int32]
 NEIGHBOURS = 14  # that make a tangent plane
 RINGS = 4  # of cells around a point that they are looked for in
 # planes are less scattered and less linear than this

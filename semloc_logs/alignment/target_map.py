@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.mask_grid import MaskGrid, build_mask_grid
 from semloc_logs.alignment.query_map import structure_of
 from semloc_logs.alignment.surface import Surface, flattened_surface, surface_of, thin_points
+from semloc_logs.arrays import F64, U8
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.mapping.selection import thin
 from semloc_logs.voxels.grid import BlockMap
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 # of correspondences, voxels: the model of the acceptance was fitted with them
 COARSE_RADII = (3.0, 1.5)
 FINE_RADII = (0.7, 0.4)

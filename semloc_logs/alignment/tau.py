@@ -8,13 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8, U64
 from semloc_logs.numerics.bits import lowest_bit
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
 CUBE = 4  # cells: observed cells are found by cubes, whose cells are the bits of a number
 FOUR_UNOBSERVED = np.uint32(UNOBSERVED_STATE * 0x01010101)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.simulation.meshes.world import F64, Scene
+from semloc_logs.simulation.meshes.world import Scene
 
 SWEEP_POINTS = 120_000
 DEPTH_SHAPE = 480, 640

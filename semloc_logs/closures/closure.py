@@ -10,8 +10,8 @@ from typing import Any, Generic, Self, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from semloc_logs.arrays import F64, I64
+
 Chosen = I64 | NDArray[np.bool_]
 Row = TypeVar("Row")
 Value = TypeVar("Value", float, F64)  # of one alignment, or the values (n,) of several

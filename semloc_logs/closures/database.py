@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.arrays import F64, I64
 from semloc_logs.closures.recent import Recent
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
@@ -22,8 +22,6 @@ from semloc_logs.words.segment_catalogue import read_words, session_segment
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 # bytes in memory at once
 TARGETS = 256 << 20  # 36 MB a submap of sparse sweeps
 SURFACES = 128 << 20

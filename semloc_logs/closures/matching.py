@@ -19,6 +19,7 @@ from semloc_logs.alignment.scores import MutualScores, mutual_scores, mutual_sha
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
+from semloc_logs.arrays import F64, I64
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import build_query, query_members, stretch
@@ -38,8 +39,6 @@ from semloc_logs.subvolumes.describe import (
 from semloc_logs.words.index import Allowed, LookUp, Matches, look_ups
 from semloc_logs.words.vocabulary import load_vocabulary
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches vote in
 # the weight of a word match falls to LEAST_WEIGHT at so many bits between the words
 FAR_WORD = 32.0

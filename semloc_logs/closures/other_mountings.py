@@ -12,13 +12,12 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.fit.findings import LEAST_PAIRS, NAMES, NEAR_VOXELS
 from semloc_logs.mapping.session_map import SessionMap
 
-F64 = NDArray[np.float64]
 Both = frozenset[str]  # two sessions by name
 
 # voxels by which such a difference moves a closure, at least; 0.75 m or 4.3 degrees at street scale

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.covariance import Stretch
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.surface import thin_points
+from semloc_logs.arrays import F64, I64
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import Fuser
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 POINTS_A_VOXEL = 2  # of a query along each edge
 
 

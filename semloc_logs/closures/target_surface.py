@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.target_map import is_uncertain, point_surface
+from semloc_logs.arrays import F64, I64
 from semloc_logs.closures.database import SQUARE_VOXELS, TargetSurface
 from semloc_logs.closures.visibility import REACH, Visibility
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.voxels.store import Keyframe
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 FAR_VIEW = 0.5  # query radii between a place and the nearest view, above which it is seen from afar
 
 

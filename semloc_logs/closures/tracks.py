@@ -7,13 +7,12 @@ sessions was located well.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.navsat import earth_centred
 from semloc_logs.mapping.session_map import SessionMap
 
-F64 = NDArray[np.float64]
 MOST_SIGMA = 5.0  # m, horizontally, of every fix
 MOST_GAP_NS = 2_000_000_000  # of a keyframe to the nearest fix; 60 m on a fast road
 APART = 500.0  # m; two sensors that see 80 m, both of those gaps, and fixes that are far off

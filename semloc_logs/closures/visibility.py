@@ -6,20 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.query_map import view_centres
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.closures.database import SQUARE_VOXELS, Database
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import blocks_path, read_blocks, read_keyframe
 from semloc_logs.words.index import Allowed
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 # voxels that a word may lie nearer to hidden keyframes than to visible ones: lanes lie apart, and
 # odometry drifts
 AMBIGUOUS_VOXELS = 32

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, Bools
 from semloc_logs.closures.acceptance.calibration import (
     EVIDENCE,
     VOTES,
@@ -33,9 +34,6 @@ from semloc_logs.closures.acceptance.placements import contradicts_odometry, pai
 from semloc_logs.closures.closure import Agreement, Veto
 from semloc_logs.evaluation.acceptance_report import SURE
 from semloc_logs.evaluation.judged_alignments import Judged
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 # the sign with which evidence may count
 SIGNS = (-1, 1, -1)  # of ``EVIDENCE``

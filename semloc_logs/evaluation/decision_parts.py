@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.calibration import (
     EVIDENCE,
     position_confidence,
@@ -21,8 +21,6 @@ from semloc_logs.closures.closure import Veto
 from semloc_logs.evaluation.acceptance_report import SURE, closures_at, kinds_of
 from semloc_logs.evaluation.calibration_fit import SIGNS, Factors, fit
 from semloc_logs.evaluation.judged_alignments import Judged
-
-F64 = NDArray[np.float64]
 
 NAMES_OF_VETOES = {
     Veto.CONTRADICTS_ODOMETRY: "the veto of odometry",

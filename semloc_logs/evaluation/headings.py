@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F64
 
 WINDOW_DEG = 20.0  # about the heading of a scenario (paper, section 4.5)
 

@@ -16,6 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, Bools
 from semloc_logs.closures.acceptance.joint_poses import JointPoses, Uncertainty
 from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.alignment_tables import read_alignments
@@ -28,8 +29,6 @@ from semloc_logs.numerics.transforms import inverse
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Rows = Bools | NDArray[np.int64]
 
 COPIES = "repeating"  # in the names of towns of copied blocks

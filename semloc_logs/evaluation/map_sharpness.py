@@ -10,17 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # voxels: edge of a place, how far its points lie from its middle, and edge of a cell
 PLACE, REACH, CELL = 66.0, 33.0, 3.0

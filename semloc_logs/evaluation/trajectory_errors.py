@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.truth import TrueTrack, read_truth
 from semloc_logs.mapping.session_map import SessionMap
@@ -22,8 +22,6 @@ from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 RPE_ROAD_M = 10.0
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.errors import TruthError, WorkspaceError
@@ -30,9 +31,6 @@ from semloc_logs.workspace import Workspace
 CORRECT_M, CORRECT_DEG = 1.0, 5.0
 REVISIT_M = 5.0
 SLACK_NS = 100_000_000  # a pose is known so far beyond the ends of its trajectory
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

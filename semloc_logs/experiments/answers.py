@@ -15,6 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs import progress
+from semloc_logs.arrays import F64
 from semloc_logs.errors import SemlocError, WorkspaceError
 from semloc_logs.experiments.kept_files import Spent, cpu_seconds, measured
 from semloc_logs.experiments.scenarios import PlannedQuery, Scenario, Trial, query_views
@@ -25,8 +26,6 @@ from semloc_logs.stages.inputs import fingerprint_of
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import POSE, pose_columns
-
-F64 = NDArray[np.float64]
 
 TABLE = "answers"
 PART_S = 60.0  # of wall time after which the answers so far are written

@@ -10,11 +10,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from semloc_logs.arrays import F64, I64, Bools
 
 THRESHOLDS_M = 1.0, 5.0  # of the rank-recall curves (paper, section 4.4)
 SAMPLES = 2000  # of a bootstrap
@@ -66,7 +63,7 @@ def _drawn(clusters: bytes, samples: int, seed: int) -> F64:
     return np.asarray(out)
 
 
-def ratio(right: Mask, passage: I64) -> Bounded:
+def ratio(right: Bools, passage: I64) -> Bounded:
     """The share of queries (q,) that are right.
 
     Bounds by bootstrap over passages. With few passages, or where all queries are alike, they are
@@ -84,7 +81,7 @@ def ratio(right: Mask, passage: I64) -> Bounded:
     return Bounded(share, low, high, passages)
 
 
-def difference(one: Mask, other: Mask, passage: I64) -> Bounded:
+def difference(one: Bools, other: Bools, passage: I64) -> Bounded:
     """How much larger the share of ``one`` (q,) is than the share of ``other`` (q,) on the same
     queries, by a paired bootstrap over passages.
     """
@@ -122,7 +119,7 @@ def _interval(values: F64) -> tuple[float, float]:
 # -- the paper's curves
 
 
-def localised(errors_m: F64, threshold_m: float, ranks: int = 1) -> Mask:
+def localised(errors_m: F64, threshold_m: float, ranks: int = 1) -> Bools:
     """Which queries (q,) have a pose within the threshold among the first ``ranks`` of (q, r)."""
     return np.asarray((errors_m[:, :ranks] <= threshold_m).any(axis=1))
 
@@ -187,7 +184,7 @@ class PrecisionRecall:
         return (float(self.precision[0]) + self.recall_at_full_precision) / 2
 
 
-def precision_recall(score: F64, right: Mask, positives: int) -> PrecisionRecall:
+def precision_recall(score: F64, right: Bools, positives: int) -> PrecisionRecall:
     """The curve of decisions that are accepted from the greatest ``score`` (n,) on; ``right`` (n,)
     tells which are true, ``positives`` how many true ones there are in all.
 
@@ -216,7 +213,7 @@ class Abstaining(NamedTuple):
     coverage: Bounded
 
 
-def abstaining(score: F64, right: Mask, passage: I64, allowed: float = 0.05) -> Abstaining:
+def abstaining(score: F64, right: Bools, passage: I64, allowed: float = 0.05) -> Abstaining:
     """False discovery rate and coverage (q,), with the least threshold that keeps the rate at or
     below ``allowed`` on other passages.
 
@@ -235,7 +232,7 @@ def abstaining(score: F64, right: Mask, passage: I64, allowed: float = 0.05) -> 
     return Abstaining(ratio(wrong, passage[answered]), ratio(answered, passage))
 
 
-def admission(score: F64, right: Mask, allowed: float) -> float:
+def admission(score: F64, right: Bools, allowed: float) -> float:
     """The least score that may be accepted for a share of wrong ones of at most ``allowed``;
     infinite where none may.
     """

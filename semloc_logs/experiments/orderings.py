@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import Bools
 from semloc_logs.experiments.answers import Answers
 from semloc_logs.experiments.measures import (
     FEWEST_PASSAGES,
@@ -24,7 +25,6 @@ THRESHOLD_M = 5.0  # within which a query is localised
 NEAR_ZERO = 0.05  # share of queries that the paper calls "not able to localize any"
 Key = tuple[str, str, str]  # system, sensor, scenario
 Known = Mapping[Key, Answers]
-Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 FPFH, SIFT = "fpfh", "sift"
@@ -104,7 +104,7 @@ def _of_family(known: Known, sensor: str, family: Family, rivals: list[str]) -> 
     return out
 
 
-def _right(answers: Answers, ranks: int = 1) -> Mask:
+def _right(answers: Answers, ranks: int = 1) -> Bools:
     return localised(answers.errors_m, THRESHOLD_M, ranks)
 
 

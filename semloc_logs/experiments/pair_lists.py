@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import TruthError
 from semloc_logs.experiments.scenarios import PlannedQuery, Scenario, Trial, query_name
 from semloc_logs.experiments.views import ViewStore
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 PAIRS = "pairs"  # the name of the scenario
 LATEST_NS = 600_000_000  # between a frame and its view: keyframes are a metre or two apart
 

@@ -12,14 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.experiments.measures import Bounded, precision_recall, ratio
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LOOP_M = 4.0  # between the frames of a loop (LCDNet, T-RO 2022; KITTI)
 PAIR_POSITIVE_M, PAIR_NEGATIVE_M = 3.0, 20.0  # SSC, IROS 2021
@@ -70,8 +66,8 @@ class Decisions(NamedTuple):
     """Scores (n,) of first frames, which of them are right (n,), and which queries have a loop."""
 
     score: F64
-    right: Mask
-    has_loop: Mask
+    right: Bools
+    has_loop: Bools
 
 
 def loop_decisions(answers: Retrieval) -> Decisions:

@@ -13,16 +13,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.evaluation.headings import in_window
 from semloc_logs.experiments.views import ViewStore
 from semloc_logs.numerics.evenly import evenly
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 PER_PASSAGE = 20  # queries around an intersection (paper, section 4.5)
 EXCLUDED_VIEWS = 50  # of the same session about a query: the protocol of KITTI loops
@@ -104,7 +100,7 @@ class _Allowed:
     database: I64
     heading_deg: float
 
-    def views(self, query: int) -> Mask:
+    def views(self, query: int) -> Bools:
         """Of the database, the views (n,) that the query is allowed to be localised with."""
         store = self.store
         if self.heading_deg == 0:
@@ -123,7 +119,7 @@ class _Allowed:
         )
         return self.database[window & self._apart(query)]
 
-    def _apart(self, query: int) -> Mask:
+    def _apart(self, query: int) -> Bools:
         """Which views are of other sessions, or far from the query in its own."""
         store = self.store
         others = store.session_of[self.database] != store.session_of[query]

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.versions import files_version, room_files
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.camera_drive import simulate_cameras
@@ -31,8 +31,6 @@ from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.tables.atomic_files import replacing_folder
-
-F64 = NDArray[np.float64]
 
 SEED = 500
 MAP, AGAIN, BACK = "map", "again", "back"

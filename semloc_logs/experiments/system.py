@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F32, F64
+
 MOST_POSES = 100  # poses of an answer that are kept; the rank-recall curves end there
 
 

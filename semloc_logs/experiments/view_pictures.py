@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.errors import LogError
 from semloc_logs.experiments.system import Picture
 from semloc_logs.frames import Camera, ImageFrame
@@ -24,10 +25,6 @@ from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.tables.atomic_files import replacing_folder
 from semloc_logs.tables.table import read_json, write_json
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 INDEX = "pictures.json"
 MOST_APART_NS = 100_000_000  # between a keyframe and its picture

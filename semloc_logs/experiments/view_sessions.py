@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import semloc_logs
+from semloc_logs.arrays import F64, U8
 from semloc_logs.experiments.system import View
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.camera_labels import PointLabels
@@ -24,8 +25,6 @@ from semloc_logs.settings import Resolved
 from semloc_logs.tables.table import write_json
 from semloc_logs.workspace import SessionFolder
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 TOPIC = "view"
 
 

@@ -12,6 +12,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.headings import headings_deg
 from semloc_logs.evaluation.truth import read_truth
@@ -21,8 +22,6 @@ from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.voxels.store import read_keyframe
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 _HIDDEN = np.full((4, 4), np.nan)  # the true pose of a query, as systems get it
 
 

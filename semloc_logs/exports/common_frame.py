@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.mapping.session_map import SessionMap
@@ -18,9 +18,6 @@ from semloc_logs.pose_graph.merged_map import keyframe_poses
 from semloc_logs.pose_graph.optimized_tables import DATUM
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 def earth_frame(work: Workspace, session: SessionMap) -> LocalFrame | None:

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.common_frame import earth_frame
@@ -18,7 +18,6 @@ from semloc_logs.pose_graph.satellite_fixes import read_fixes
 from semloc_logs.tables.table import read_table
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 DEGREES = 7  # decimals: a centimetre
 METRES = 2
 COPIED = ("query_session", "target_session", "query_stamp_ns", "target_stamp_ns", "probability")

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8
 from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.exports.point_formats import point_colours
 from semloc_logs.logs.annotation.scene import Cloud
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 MOST_POINTS = 100_000  # 1.7 MB of a log
 MOST_SESSIONS = 8  # the first ones
 COARSER = 1.5  # cells grow so much until there are few enough points

@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.common_frame import CommonFrame
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.store import read_keyframe
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 # x from, y from, x to, y to; metres, the upper ones excluded
 Bounds = tuple[float, float, float, float]
 FLOAT32_FINENESS = 16  # steps of 32-bit coordinates in a voxel, at least

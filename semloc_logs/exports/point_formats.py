@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import semloc_logs
+from semloc_logs.arrays import F64, U8
 from semloc_logs.errors import SemlocError, WorkspaceError
 from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.labels.space import BUILDING, GROUND, UNLABELLED, VEGETATION, cityscapes
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 Batches = Iterator[tuple[F64, U8]]
 LAS_SCALE = 0.001  # metres
 LAS_ROWS = 1 << 20  # laspy and lazrs write so many points at once

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, transform
 from semloc_logs.pose_graph.g2o import edge_line, vertex_line
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 # fixed part, and part per metre of road
 ODOMETRY_SIGMA_M = (0.02, 0.01)
 ODOMETRY_SIGMA_RAD = (0.002, 0.002)

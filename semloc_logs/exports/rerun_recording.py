@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.errors import SemlocError
 from semloc_logs.exports.common_frame import KeyframeMotion
@@ -22,8 +22,6 @@ from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.pictures.placement import Placement, Tie, place_sessions
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 # of drives, one after the other; told apart with any colour vision (Okabe, Ito)
 DRIVES = (
     (0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0),

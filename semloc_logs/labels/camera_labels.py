@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U32
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Camera, ImageFrame, PosedCloud
-from semloc_logs.labels.painting import U32, Viewpoint, paint, without_borders
+from semloc_logs.frames import Camera, ImageFrame, PosedCloud
+from semloc_logs.labels.painting import Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
 from semloc_logs.logs.problems import ProblemKind, Problems

@@ -11,13 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
 from semloc_logs.labels.sweep_ground import REACH, GroundSurface, ground_surface
 from semloc_logs.labels.voxel_features import Voxels, VoxelShapes, objects, voxel_shapes, voxelise
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 
 VOXEL = 0.30  # (m)
 # points lower than this are ground; a small scale does not make sensors better (m)

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64, U8
 from semloc_logs.labels.from_geometry import LEAST_ON_GROUND, ON_GROUND, VOXEL
-from semloc_logs.labels.space import GROUND, U8, UNLABELLED
+from semloc_logs.labels.space import GROUND, UNLABELLED
 from semloc_logs.labels.sweep_ground import ground_surface
-
-I64 = NDArray[np.int64]
 
 # share of the points whose ids a space has: every shipped space describes all ids of its data set
 LEAST_KNOWN = 0.9

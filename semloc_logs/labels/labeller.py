@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8, U32
 from semloc_logs.errors import LogError
 from semloc_logs.frames import ImageFrame, LabelForm, PosedCloud
 from semloc_logs.labels.camera_labels import Painted, Pictures, PointLabels
@@ -19,8 +20,6 @@ from semloc_logs.labels.segmentation import Segmenter
 from semloc_logs.labels.space import (
     SKY,
     THINGS,
-    U8,
-    U32,
     UNLABELLED,
     UNPAINTED,
     LabelSpace,

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, F64
+from semloc_logs.arrays import F32, F64, U32
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
 from semloc_logs.logs.sensors.sweeps import in_base
@@ -42,8 +42,6 @@ _NOTHING = 1e9  # m, the depth of cells without a surface
 _BEHIND_SHARE = 1.1  # of the depth of the nearer surface, and
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
 _MOST_LABELS = 40  # of a picture that are looked at: more are noise
-
-U32 = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F64, Camera
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Camera
 from semloc_logs.logs.sensors.picture_calibration import fitted_camera, optics_of
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected

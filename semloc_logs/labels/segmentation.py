@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8, U32
 from semloc_logs.errors import SettingsError
 from semloc_logs.labels.segmentation_spec import Spec, read_spec
-from semloc_logs.labels.space import U8, U32, UNLABELLED, UNPAINTED, is_file_name, read_space
+from semloc_logs.labels.space import UNLABELLED, UNPAINTED, is_file_name, read_space
 from semloc_logs.settings import Labels
 
 _MEMORY: int = Labels.model_fields["memory"].default  # bytes

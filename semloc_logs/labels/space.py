@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8, U32
 from semloc_logs.errors import SettingsError
 from semloc_logs.schemas import names, read_text
 from semloc_logs.settings import read_yaml
@@ -26,9 +27,6 @@ GROUND = (ROAD, SIDEWALK, TERRAIN)
 THINGS = (POLE, 6, 7, *range(11, 19))
 KNOWS_CLASSES = ("log", "onnx")  # label sources with classes that the semantic network understands
 _HIGHEST_ID = 0xFFFF
-
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I32, I64
 from semloc_logs.numerics.cells import by_cell
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 CELL = 1.0  # of the grid, at street scale (m)
 # points farther than this from the sensor, in x, y or z, are left out, at street scale (m)

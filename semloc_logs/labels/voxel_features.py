@@ -10,15 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.numerics.cells import cell_starts
 from semloc_logs.numerics.eigen import eigen
 from semloc_logs.numerics.local_shape import MOMENTS, add_point, covariance, principal_axes
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-B = NDArray[np.bool_]
 
 # of surroundings without normals: as if they pointed everywhere
 NO_TILT = 1 / 3
@@ -260,7 +256,7 @@ def _columns(ijk: I64, start: I64, nx: int, ny: int) -> tuple[I64, I64]:
     return up, down
 
 
-def objects(voxels: Voxels, member: B, height: F64, size: float) -> tuple[F64, F64, F64]:
+def objects(voxels: Voxels, member: Bools, height: F64, size: float) -> tuple[F64, F64, F64]:
     """Length, width and top (m,) of the object of each ``member`` voxel (m,), seen from above.
 
     Zeros for the other voxels. Objects are columns of members that touch, also by their corners.
@@ -283,7 +279,7 @@ def objects(voxels: Voxels, member: B, height: F64, size: float) -> tuple[F64, F
 
 
 @njit(cache=True, nogil=True)
-def _label(ijk: I64, start: I64, nx: int, ny: int, member: B) -> tuple[I64, int]:
+def _label(ijk: I64, start: I64, nx: int, ny: int, member: Bools) -> tuple[I64, int]:
     """The number (m,) of the object of each voxel, 0 for no member, and the next free number."""
     m = len(ijk)
     number = np.zeros(m, np.int64)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F64
+
 Axes = tuple[float, float, float]
 
 

@@ -7,14 +7,12 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.mapping.up_evidence import Sky, UpEvidence
 from semloc_logs.numerics.transforms import angle_between
-
-F64 = NDArray[np.float64]
 
 
 class UpSource(Enum):

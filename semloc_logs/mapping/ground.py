@@ -18,13 +18,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.labels.sweep_ground import CELL, GroundSurface
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.keys import pack, unpack
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # of the height below a keyframe, at street scale (m): how far around the sensor, from how far below
 # it on to how far, in which steps, and where it is assumed without points

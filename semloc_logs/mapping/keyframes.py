@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import progress
+from semloc_logs.arrays import F32, F64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.camera_labels import PointLabels
@@ -24,9 +25,6 @@ from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.settings import ResolvedFusion
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U32 = NDArray[np.uint32]
 MOST_VIEWS = 20  # keyframes that show where up is
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.poses.tf_tree import frame_name
@@ -26,7 +26,6 @@ from semloc_logs.mapping.up_evidence import UpEvidence
 from semloc_logs.numerics.transforms import inverse, rotation_between
 from semloc_logs.settings import STREET_VOXEL, Resolved
 
-F64 = NDArray[np.float64]
 # voxels; of the tables that are indexed by place the coarse one of the ground ends first
 # (voxels/keys.py)
 REACH = 3_000_000

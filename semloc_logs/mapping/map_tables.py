@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import progress
+from semloc_logs.arrays import F64
 from semloc_logs.labels.camera_labels import PointLabels
 from semloc_logs.labels.space import SKY
 from semloc_logs.labels.sweep_ground import GroundSurface, ground_surface
@@ -38,8 +39,6 @@ from semloc_logs.voxels.store import (
     write_voxels,
 )
 from semloc_logs.workspace import SessionFolder
-
-F64 = NDArray[np.float64]
 
 VIEW = 24.0  # m at voxels of 0.30 m: as far as a query looks
 PROGRESS_EVERY = 50  # keyframes

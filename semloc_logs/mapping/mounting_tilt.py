@@ -7,11 +7,9 @@ walls then contradict gravity, as the IMU and the convention of frames have it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import angle_between
-
-F64 = NDArray[np.float64]
 
 LEAST_TURN = np.radians(4.0)  # lanes are banked by a degree or two, an IMU is off by one
 SURE = np.radians(2.5)  # by so much the IMU and the convention of frames may differ

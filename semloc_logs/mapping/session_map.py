@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.labels.space import KNOWS_CLASSES
 from semloc_logs.logs.log import MAP_FORMAT
@@ -19,7 +20,6 @@ from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 
-F64 = NDArray[np.float64]
 KEPT = 64  # keyframes in memory: a query of 20 m and the next one
 
 

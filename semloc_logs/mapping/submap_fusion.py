@@ -7,12 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.store import Keyframe
-
-F64 = NDArray[np.float64]
 
 
 def fuse_ranges(

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.local_shape import shape
 
-F64 = NDArray[np.float64]
 MOST_POINTS = 12_000  # of a keyframe that normals are taken from
 # so many cells lie one behind the other within the median range, where the points are as dense as
 # that

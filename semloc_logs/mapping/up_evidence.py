@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.up_direction import LEAST_NORMALS, FlatPlaces, refined
-
-F64 = NDArray[np.float64]
 
 # chosen by hand on real and simulated drives, for the lead of up on them. A floor counts whole,
 # because a map without one is rare; the others decide between a floor and a wall or a ceiling.

@@ -11,8 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
+from semloc_logs.arrays import I32, I64
 
 
 @njit(cache=True, nogil=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F64
+
 # of Jacobi rotations; four are enough for double precision, more cost nothing once it has converged
 SWEEPS = 12
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-I64 = NDArray[np.int64]
+from semloc_logs.arrays import I64
 
 EMPTY = -(1 << 63)  # in place of a key; no caller has it as a key
 LEAST_PLACES = 1024

@@ -12,11 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.numerics.eigen import eigen
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MOMENTS = 10  # the weight and the weighted sums of x, y, z, xx, xy, xz, yy, yz, zz
 LEAST_POINTS = 4  # that have a shape: three always lie in a plane

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-Array = NDArray[np.float64]
+from semloc_logs.arrays import F64
 
 
-def transform(translation: Array, quaternion_xyzw: Array) -> Array:
+def transform(translation: F64, quaternion_xyzw: F64) -> F64:
     """4x4 matrices from translations (..., 3), m, and quaternions (..., 4) xyzw of any length."""
     t = np.asarray(translation, float)
     q = np.asarray(quaternion_xyzw, float)
@@ -24,14 +24,14 @@ def transform(translation: Array, quaternion_xyzw: Array) -> Array:
     return out
 
 
-def translation_quaternion(target_T_source: Array) -> tuple[Array, Array]:
+def translation_quaternion(target_T_source: F64) -> tuple[F64, F64]:
     """Translations (..., 3) and unit quaternions (..., 4) xyzw, w >= 0, of matrices (..., 4, 4)."""
     m = np.asarray(target_T_source, float)
     q = Rotation.from_matrix(m[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return m[..., :3, 3].copy(), q.reshape(*m.shape[:-2], 4)
 
 
-def inverse(target_T_source: Array) -> Array:
+def inverse(target_T_source: F64) -> F64:
     """``source_T_target`` for matrices (..., 4, 4)."""
     m = np.asarray(target_T_source, float)
     out = np.zeros_like(m)
@@ -42,14 +42,14 @@ def inverse(target_T_source: Array) -> Array:
     return out
 
 
-def apply(target_T_source: Array, points: NDArray[np.floating]) -> Array:
+def apply(target_T_source: F64, points: NDArray[np.floating]) -> F64:
     """Points (n, 3) of the source frame expressed in the target frame, float64."""
     return np.asarray(points, float) @ target_T_source[:3, :3].T + target_T_source[:3, 3]
 
 
 def yaw_transform(
-    yaw: float, translation: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> Array:
+    yaw: float, translation: F64 | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> F64:
     """Rotation by ``yaw`` about +z, then translation."""
     out = np.eye(4)
     c = np.cos(yaw)
@@ -59,7 +59,7 @@ def yaw_transform(
     return out
 
 
-def turned_about_z(points: Array, yaw: Array) -> Array:
+def turned_about_z(points: F64, yaw: F64) -> F64:
     """Points (n, 3), each turned about +z by its own of ``yaw`` (n,)."""
     c = np.cos(yaw)
     s = np.sin(yaw)
@@ -68,7 +68,7 @@ def turned_about_z(points: Array, yaw: Array) -> Array:
     )
 
 
-def exp_se3(t: Array, rotation_vector: Array) -> Array:
+def exp_se3(t: F64, rotation_vector: F64) -> F64:
     """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side.
 
     This is not the exponential of se(3).
@@ -79,17 +79,17 @@ def exp_se3(t: Array, rotation_vector: Array) -> Array:
     return out
 
 
-def rotation_angle(rotation: Array) -> float:
+def rotation_angle(rotation: F64) -> float:
     """Angle in radians of a 3x3 rotation matrix, accurate near zero."""
     return float(np.linalg.norm(Rotation.from_matrix(rotation).as_rotvec()))
 
 
-def angle_between(a: Array, b: Array) -> float:
+def angle_between(a: F64, b: F64) -> float:
     """Angle in radians between two directions (3,) of any length, accurate near zero."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
-def rotation_between(source: Array, target: Array) -> Array:
+def rotation_between(source: F64, target: F64) -> F64:
     """The smallest rotation (3, 3) that turns direction ``source`` into direction ``target``."""
     a = source / np.linalg.norm(source)
     b = target / np.linalg.norm(target)
@@ -105,7 +105,7 @@ def rotation_between(source: Array, target: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix())
 
 
-def interpolate(stamps_ns: NDArray[np.int64], poses: Array, at_ns: NDArray[np.int64]) -> Array:
+def interpolate(stamps_ns: NDArray[np.int64], poses: F64, at_ns: NDArray[np.int64]) -> F64:
     """Poses (m, 4, 4) at ``at_ns`` (m,), interpolated on SO(3) x R^3.
 
     ``poses`` (n, 4, 4) are at strictly increasing ``stamps_ns`` (n,). Times outside the range take

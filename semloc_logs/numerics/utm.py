@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.wgs84 import E2, FLATTENING, SEMI_MAJOR
 
-F64 = NDArray[np.float64]
 SCALE = 0.9996
 FALSE_EASTING = 500_000.0
 FALSE_NORTHING = 10_000_000.0  # south of the equator

@@ -6,11 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.pictures.colours import PALE, class_colours
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
-
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 
 EDGE = 12.0  # pixels of a voxel's edge
 MARGIN = 2  # pixels around the boxes

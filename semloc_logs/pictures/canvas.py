@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import I32, I64, U8
 from semloc_logs.labels.space import GROUND, UNLABELLED
 from semloc_logs.pictures.colours import class_colours
-
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 NOTHING = np.iinfo(np.int32).min  # the height where no voxel is
 STRIP = 128  # rows of pixels that are shaded at once

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.mask_grid import FREE_BIT, look_up
+from semloc_logs.arrays import F64, U8
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.pictures.closure_view import ClosureView
 from semloc_logs.pictures.colours import (
@@ -18,10 +18,6 @@ from semloc_logs.pictures.colours import (
     class_legend,
 )
 from semloc_logs.pictures.solids import Solid, View, draw_solids, top_view
-
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 
 PANEL = 640  # pixels along an edge of a picture from above
 PALENESS = 0.78  # how far the target's colours are from their own to pale

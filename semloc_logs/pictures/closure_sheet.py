@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.pictures.boxes import draw_boxes
 from semloc_logs.pictures.closure_scene import ClosureScene
 from semloc_logs.pictures.closure_view import ClosureView
@@ -32,9 +32,6 @@ from semloc_logs.pictures.sheet import Lettering, Panel, Sheet, write_sheets
 from semloc_logs.pictures.solids import View
 from semloc_logs.pictures.times import time_text
 from semloc_logs.subvolumes.cut import SIZE
-
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 
 SUBVOLUME = (208, 240)  # pixels of a subvolume's picture: width, height
 HEADING = 0.16  # length of the arrow that shows where the query looks, over the scene's radius

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.target_map import Target
+from semloc_logs.arrays import F64, U8
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import allowed_words, match_words
@@ -31,8 +32,6 @@ from semloc_logs.voxels.grid import UNOBSERVED_STATE
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 APART = 3 * SIZE // 4  # voxels between subvolumes that are shown
 AGREES = 8  # voxels that a word match may lie off the alignment
 TURNED = np.radians(15.0)  # and by how much it may be turned against it

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.closures.closure import Closure
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
@@ -29,9 +29,6 @@ from semloc_logs.pictures.sheet import Lettering, Panel, Sheet
 from semloc_logs.pictures.times import period_text
 from semloc_logs.tables.table import read_table
 from semloc_logs.workspace import Workspace
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 WIDTH = 1400  # pixels of the longer edge
 EDGES = (0.2, 99.8)  # percentiles of the maps between which the picture lies

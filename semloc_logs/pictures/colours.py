@@ -5,11 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.labels.space import GROUND, UNLABELLED, cityscapes
 
-U8 = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 Legend = list[tuple[str, Colour]]
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.pictures.boxes import draw_boxes
 from semloc_logs.pictures.colours import class_legend
 from semloc_logs.pictures.sheet import Lettering, Panel, Sheet
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
-
-U8 = NDArray[np.uint8]
 
 
 def draw_completions(path: Path, variant: str, given: U8, predicted: U8, truth: U8) -> None:

@@ -10,11 +10,9 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.pictures.colours import GRID, INK, SOFT, WHITE, Colour, web_colour
-
-F64 = NDArray[np.float64]
 
 DPI = 100  # of a sheet of ordinary size; lengths of pixels are at this resolution
 TEXT, SMALL = 10.0, 9.0  # points

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I32, I64, U8
 from semloc_logs.pictures.canvas import Canvas
 from semloc_logs.pictures.colours import DRIVE, START, class_legend
 from semloc_logs.pictures.map_marks import draw_drive, draw_grid
@@ -30,11 +31,6 @@ STRAY = 0.001  # this share of the voxels may lie beyond each edge of the pictur
 STRAY_CELL = 8  # voxels by which the edges are found
 HEADROOM = 2  # voxels above the sensor that are drawn indoors
 ROOF_REACH = 3  # voxels around the drive in which a roof is looked for
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

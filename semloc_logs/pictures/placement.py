@@ -11,15 +11,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import interpolate, inverse, transform, yaw_transform
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 GAP = 0.06  # between groups, over the width of the picture
 LEAST_GAP = 240  # voxels: a map reaches about half as far beside its road
 ASPECT = 1.6  # of the picture: width over height

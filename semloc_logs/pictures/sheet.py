@@ -20,15 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.transforms import Affine2D, Transform
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.pictures.colours import INK, SOFT, WHITE, Colour, Legend, web_colour
 from semloc_logs.pictures.fonts import written
 from semloc_logs.pictures.map_marks import DPI, SMALL, TEXT, scale_bar
 from semloc_logs.tables.atomic_files import replacing_file
-
-U8 = NDArray[np.uint8]
 
 # Lengths are pixels of a sheet of ordinary size; a large sheet is as much finer (dots per inch), so
 # that letters and lines grow with it.

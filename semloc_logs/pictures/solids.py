@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.numerics.transforms import apply
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 SHARPER = 2  # drawn so many times as large, and reduced
 LIGHT = np.array([0.3, 0.45, 0.85])  # to the right, towards the viewer over the ground, up
 AT_ONCE = 1 << 15  # faces

@@ -13,16 +13,14 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.sparse import bsr_array
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.pose_graph.normal_equations import NormalEquations, crossed, moved
 
 LOGGER = logging.getLogger(__name__)
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 BAND = 11  # entries below the diagonal of blocks of 6 next to each other
 NODES_OF_POSE = 3
 MOST_NODES = 300  # their matrix is dense

@@ -13,17 +13,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.graph import Loops, PoseGraph
 from semloc_logs.pose_graph.odometry_noise import OdometryNoise
 from semloc_logs.settings import ResolvedOptimize
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 # standard deviations that a way around may be off; 3.5 of a normal distribution in 3 axes: 0.7 %
 GATE = 3.5
 STARTS = 32  # closures of most agreement from which a set is grown
@@ -88,7 +85,7 @@ def _pairs(graph: PoseGraph, loops: Loops) -> Iterator[tuple[int, int, I64]]:
 
 def _agreement(
     graph: PoseGraph, loops: Loops, noise: OdometryNoise, settings: ResolvedOptimize
-) -> Mask:
+) -> Bools:
     """Which closures (m, m) of one pair of sessions are consistent; each is with itself."""
     sigma_m, sigma_rad = _own_sigma(loops, settings)
     target = graph.map_T_base[loops.target]
@@ -141,7 +138,7 @@ def _independence(graph: PoseGraph, loops: Loops, stretch: float) -> F64:
     return np.asarray(1.0 / counts[place.ravel()])
 
 
-def largest_clique(agree: Mask, weight: F64 | None = None) -> I64:
+def largest_clique(agree: Bools, weight: F64 | None = None) -> I64:
     """Rows (k,), ascending, of a heavy set in which all agree: greedy from the best starts."""
     weight = np.ones(len(agree)) if weight is None else weight
     degree = agree @ weight
@@ -158,7 +155,7 @@ def largest_clique(agree: Mask, weight: F64 | None = None) -> I64:
     return np.sort(best)
 
 
-def _grown(agree: Mask, start: int, order: I64) -> I64:
+def _grown(agree: Bools, start: int, order: I64) -> I64:
     """A clique with ``start``: the next in ``order`` that agrees with all so far, to the end."""
     members = [start]
     left = agree[start].copy()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.pose_graph.graph import Positions
 
-F64 = NDArray[np.float64]
 LEAST_FIXES = 3
 LEAST_SPREAD = 10.0  # standard deviations of a fix: the heading is known to 6 degrees
 ITERATIONS = 50

@@ -7,12 +7,10 @@ GTSAM and Ceres read it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.pose_graph.problem import Edges
-
-F64 = NDArray[np.float64]
 
 
 def vertex_line(number: int, pose: F64) -> str:

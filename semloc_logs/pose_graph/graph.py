@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from semloc_logs.arrays import F64, I64, Bools
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +48,7 @@ class Loops:
     def __len__(self) -> int:
         return len(self.target)
 
-    def part(self, rows: I64 | Mask) -> Loops:
+    def part(self, rows: I64 | Bools) -> Loops:
         """Some of the rows."""
         return Loops(
             self.target[rows],
@@ -78,7 +75,7 @@ class Positions:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def part(self, rows: I64 | Mask) -> Positions:
+    def part(self, rows: I64 | Bools) -> Positions:
         """Some of the rows."""
         return Positions(
             self.vertices[rows], self.antenna[rows], self.position[rows], self.sigma[rows]

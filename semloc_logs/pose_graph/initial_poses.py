@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.consistent_sets import ConsistentSet
 from semloc_logs.pose_graph.graph import PoseGraph
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

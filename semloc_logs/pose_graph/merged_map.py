@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8, Bools
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
@@ -30,10 +30,6 @@ from semloc_logs.voxels.keys import morton, pack, unpack
 from semloc_logs.voxels.store import TILE, poses_of
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Tile = tuple[int, int]
 NONE = -1
 NEIGHBOURS = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)], np.int64)
@@ -194,7 +190,7 @@ class _Tile:
         self._free[0, chosen] = session
         self._free[1, chosen] = stamps_ns[chosen]
 
-    def _occupied_by(self, session: int) -> tuple[Mask, Mask]:
+    def _occupied_by(self, session: int) -> tuple[Bools, Bools]:
         """Which voxels the session saw occupied, and beside which it saw an occupied one."""
         if session not in self._seen:
             return np.zeros(len(self.keys), bool), np.zeros(len(self.keys), bool)
@@ -204,7 +200,7 @@ class _Tile:
             is_near |= np.isin(pack(self._ijk + step), keys)
         return np.isin(self.keys, keys), is_near
 
-    def _free_by(self, submaps: Sequence[PlacedSubmap], wanted: Mask) -> tuple[Mask, I64]:
+    def _free_by(self, submaps: Sequence[PlacedSubmap], wanted: Bools) -> tuple[Bools, I64]:
         """Which of the ``wanted`` voxels submaps saw free, and none occupied; with stamps."""
         free = np.zeros(len(self.keys), bool)
         other = np.zeros(len(self.keys), bool)

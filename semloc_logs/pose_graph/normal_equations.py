@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.graph import NO_POSITIONS, Positions
 from semloc_logs.pose_graph.problem import Directions, Edges
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 UP_HUBER = 1.345  # Huber's constant for 95 % efficiency: gravity may be wrong in places
 FIX_CAUCHY = 3.0  # standard deviations at which a satellite fix counts half
 SMALL_TURN = 1e-4  # radians, below which series replace quotients

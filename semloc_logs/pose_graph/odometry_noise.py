@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.settings import ResolvedOptimize
 
-F64 = NDArray[np.float64]
 REFERENCE_M = 100.0  # the settings give the drift after so much road
 # noise of a single pose, so that keyframes of several sensors at one place are not one vertex
 LEAST_M = 0.01

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.carried_poses import SolvedPoses
 from semloc_logs.pose_graph.consistent_sets import ConsistentSet, consistent_sets
@@ -22,9 +22,6 @@ from semloc_logs.pose_graph.problem import Problem, coarse_problem, fine_problem
 from semloc_logs.pose_graph.solver import BOUND, Method, Solution, Solver
 from semloc_logs.settings import ResolvedOptimize
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 # closures of two sessions that agree, from which on the ones that do not are doubted
 CONFIRMED = 3
 SAME_PLACE_M = 1e-6  # keeps keyframes of one place in order
@@ -53,14 +50,14 @@ class Optimised:
     problem: Problem
     solved: F64
     component: I64
-    is_enu: Mask
+    is_enu: Bools
     verdict: list[Verdict]
     squared_error: F64
     method: Method
     covariance: F64 | None = None
 
     @property
-    def kept(self) -> Mask:
+    def kept(self) -> Bools:
         """Which closures (m,) hold."""
         return np.array([verdict is Verdict.KEPT for verdict in self.verdict], bool)
 
@@ -139,14 +136,14 @@ def _located(graph: PoseGraph, poses: F64, component: I64) -> _Located:
     return _Located(replace(graph, fixes=graph.fixes.part(is_used)), out)
 
 
-def _have_fixes(graph: PoseGraph, component: I64) -> Mask:
+def _have_fixes(graph: PoseGraph, component: I64) -> Bools:
     """Chains (k,) whose component has enough fixes to lie in east, north, up."""
     of_fix = component[graph.chain_of[graph.fixes.vertices]]
     counts = np.bincount(of_fix, minlength=int(component.max(initial=-1)) + 1)
     return np.asarray(counts[component] >= LEAST_FIXES)
 
 
-def _consistent(graph: PoseGraph, sets: list[ConsistentSet]) -> Mask:
+def _consistent(graph: PoseGraph, sets: list[ConsistentSet]) -> Bools:
     """The closures (m,) of each pair of sessions that do not contradict several others of it."""
     consistent = np.ones(len(graph.loops), bool)
     for pair in sets:
@@ -165,7 +162,7 @@ def _readmitted(solver: Solver, solution: Solution) -> Solution:
     return solution
 
 
-def _components(graph: PoseGraph, kept: Mask) -> I64:
+def _components(graph: PoseGraph, kept: Bools) -> I64:
     """Chains (k,) that closures connect, numbered by their first."""
     count = len(graph.chains)
     a = graph.chain_of[graph.loops.target[kept]]

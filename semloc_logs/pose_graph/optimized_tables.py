@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
@@ -26,8 +26,6 @@ from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import pose_columns, poses_of
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Metadata = Mapping[str, Any]
 DATUM = "datum_lat_lon_height"
 

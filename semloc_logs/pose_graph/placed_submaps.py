@@ -10,16 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64, U8
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.voxels.grid import BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
 from semloc_logs.voxels.store import blocks_path, read_blocks
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
-
 
 KEPT = 16  # submaps in memory: the ones of a tile
 

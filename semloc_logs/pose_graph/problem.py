@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.graph import (
     NO_POSITIONS,
@@ -21,8 +22,6 @@ from semloc_logs.pose_graph.graph import (
 from semloc_logs.pose_graph.odometry_noise import OdometryNoise
 from semloc_logs.settings import ResolvedOptimize
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 COARSE = 4
 MOST_COARSE = 10_000  # vertices of a coarse problem, but for the ends of sessions
 

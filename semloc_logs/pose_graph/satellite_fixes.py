@@ -7,6 +7,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, transform
@@ -14,8 +15,6 @@ from semloc_logs.pose_graph.graph import Datum, Positions
 from semloc_logs.tables.table import read_table
 from semloc_logs.voxels.store import poses_of
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 MOST_SIGMA = 20.0  # m, horizontally; a fix that is less certain tells nothing
 USUAL_SIGMA = 5.0  # m, where the receiver does not know
 UNKNOWN_HEIGHT = 1e4  # m, the uncertainty of a height that was not measured

@@ -17,10 +17,10 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import SemlocError
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.conjugate_gradients import Layout, Limits, minimised
@@ -36,9 +36,6 @@ from semloc_logs.pose_graph.normal_equations import (
 from semloc_logs.pose_graph.problem import Edges, Problem
 
 LOGGER = logging.getLogger(__name__)
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 # share of right closures whose errors are below the bound, if their covariances are right
 INLIER_SHARE = 0.999
 BOUND = float(chi2.ppf(INLIER_SHARE, 6))  # squared and whitened error of a right closure

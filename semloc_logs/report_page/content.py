@@ -9,9 +9,9 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import semloc_logs
+from semloc_logs.arrays import F64
 from semloc_logs.closures.closure import FEATURES, Agreement, Closure, Rejected
 from semloc_logs.closures.closure_tables import AGREEMENT_COLUMNS
 from semloc_logs.closures.exclusions import Exclusions
@@ -23,7 +23,6 @@ from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_json
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 Row = Mapping[str, Any]
 # session and stamp of the query, session and stamp of the target
 Key = tuple[str, int, str, int]

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pictures.map_picture import bare_map
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 SHEET = 1100  # pixels along the longer edge of a session's map, at most
 LEAST_SHEET = 360
 ALL_SHEETS = 12e6  # pixels of all maps together

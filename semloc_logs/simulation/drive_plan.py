@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import SettingsError
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.trajectory import smooth_line
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.meshes.world import F64
 from semloc_logs.simulation.output.drive_log import FORMATS
 from semloc_logs.simulation.town.road_network import (
     RoadNetwork,

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import semloc_logs
+from semloc_logs.arrays import F64
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.map_cloud import map_cloud
@@ -35,7 +35,6 @@ from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import session_name
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 MOST_POSITIONS = 2000  # of a drive in the overview
 SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import semloc_logs
+from semloc_logs.arrays import I64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pose_graph.assembly import pose_graph_of
@@ -34,7 +34,6 @@ from semloc_logs.stages.lock import one_writer
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.workspace import Workspace
 
-I64 = NDArray[np.int64]
 Sessions = dict[str, SessionMap]
 
 

@@ -8,17 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, SIZE, code_table
 from semloc_logs.subvolumes.network import Completion
 from semloc_logs.subvolumes.weight_files import load_weights
 from semloc_logs.voxels.grid import FREE_STATE
-
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
-
 
 BATCH = 16
 

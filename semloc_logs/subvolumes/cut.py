@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
@@ -21,8 +22,6 @@ SIZE, MARGIN = 32, 8
 GRID = 8  # voxels: the coarsest stride
 WIDE = SIZE + 2 * MARGIN
 CLASSES = {"semantic": 19, "geometric": 1}
-
-U8 = NDArray[np.uint8]
 
 
 def plain_name(variant: str) -> str:

@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, U8
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
@@ -25,8 +26,6 @@ from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 if TYPE_CHECKING:
     from semloc_logs.subvolumes.network import Encoder
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
 BELOW_GROUND = 1.0  # of the lowest layer (m at 0.30 m voxels)
 LAYER = 8
 RARE = 0.05  # a layer with a smaller share of the subvolumes is not worth a pass of the network

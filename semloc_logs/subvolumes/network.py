@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semloc_logs.arrays import F32, U8
 from semloc_logs.subvolumes.cut import CLASSES
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
 LATENT = 256
 EMBEDDING = 8
 CHANNELS = (16, 32, 64)

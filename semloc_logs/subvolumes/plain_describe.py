@@ -13,15 +13,13 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, I64, U8
 from semloc_logs.subvolumes.cut import SIZE, code_table, plain_name
 from semloc_logs.subvolumes.describe import Described
 from semloc_logs.subvolumes.plain_network import PlainEncoder
 from semloc_logs.subvolumes.weight_files import load_weights, weights_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 TILE = 256  # voxels along the edge of the part of a map that is in memory at once
 BATCH = 64  # subvolumes that are encoded together
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semloc_logs.arrays import F32, U8
 from semloc_logs.subvolumes.cut import CLASSES, SIZE
 from semloc_logs.subvolumes.network import (
     LATENT,
@@ -35,8 +36,6 @@ from semloc_logs.subvolumes.network import (
     space_to_depth,
 )
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
 BoxArrays = tuple[U8, F32, U8]
 Filters = tuple[F32, F32, F32]
 Place = tuple[int, int, int]

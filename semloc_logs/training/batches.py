@@ -20,16 +20,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from semloc_logs.arrays import U8
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.training.pairs import ROW_GROUP, read_shard
 from semloc_logs.training.schedule import FIRST_SCENES, samples_after, scene_window
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 
-U8 = NDArray[np.uint8]
 Pairs = tuple[U8, U8, U8]
 # s beyond a deadline for pairs that are being read; scenes that are still to be made take longer
 PATIENCE = 5.0

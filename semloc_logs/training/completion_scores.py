@@ -6,13 +6,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Network, descriptors
 from semloc_logs.training.network_training import targets
-
-U8 = NDArray[np.uint8]
 
 
 @torch.inference_mode()

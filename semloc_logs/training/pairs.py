@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import U8
 from semloc_logs.numerics import transforms
 from semloc_logs.settings import STREET_VOXEL, ResolvedFusion, Training
 from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
-U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
 PER_FRAME = 12  # pairs that are tried
 MIN_OCCUPIED = 40  # voxels of a subvolume that is worth describing

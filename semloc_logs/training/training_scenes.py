@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.conditions import SEASONS, Condition
 from semloc_logs.simulation.drives.traffic import Traffic, random_traffic
 from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
-from semloc_logs.simulation.meshes.world import F64, Scene, World
+from semloc_logs.simulation.meshes.world import Scene, World
 from semloc_logs.simulation.sensors.camera import CAMERAS, CameraModel, camera_points
 from semloc_logs.simulation.sensors.label_errors import corrupt_labels
 from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep

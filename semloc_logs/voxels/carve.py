@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I64, U8
 from semloc_logs.labels.space import GROUND
 from semloc_logs.numerics.hash_table import (
     EMPTY,
@@ -38,10 +39,6 @@ UNOBSERVED = -128  # in log-odds
 MARGIN = 1e-3  # voxels around the rays, as positions from the grid's corner are rounded once more
 LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
 
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 Votes = NDArray[np.uint32]
 
 

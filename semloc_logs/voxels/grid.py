@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64, U8
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.numerics.bits import EACH_BYTE, bytes_set, popcount
 from semloc_logs.numerics.hash_table import EMPTY
@@ -31,9 +32,6 @@ FREE_STATE, UNOBSERVED_STATE = 254, 253
 EIGHTS = BLOCK**3 // 8  # words of eight states in a block
 SCALE = 20  # int8 log-odds are in units of 1/20
 FIRST_PLACES = 1 << 15  # of the table of votes, which grows
-
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64
+
 BLOCK = 16
 _BIAS = 1 << 20
 _MASK = (1 << 21) - 1
-
-I64 = NDArray[np.int64]
 
 
 def pack(ijk: NDArray[np.integer]) -> I64:

@@ -23,19 +23,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I32, I64, U8, U32, U64, Bools
 from semloc_logs.numerics.bits import lowest_bit, popcount
 from semloc_logs.words.kmeans import grid
 from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
 
-U8 = NDArray[np.uint8]
-U64 = NDArray[np.uint64]
-U32 = NDArray[np.uint32]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 # of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
 Ranges = tuple[I64, I64, I64, I64]
 SHORTLIST = 32  # nearest codes in Hamming distance that are compared asymmetrically

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from semloc_logs.arrays import F32
+
 STEP = 2.0**-11
 BLOCK = 16384  # points compared at once: 16 MB of similarities to 256 centroids
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
+from semloc_logs.arrays import F32
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes.cut import plain_name
 from semloc_logs.words.vocabulary import (
@@ -28,7 +29,6 @@ from semloc_logs.words.vocabulary import (
     train_vocabulary,
 )
 
-F32 = NDArray[np.float32]
 USUAL_LENGTH = 0.5  # of s times a descriptor: nearly all are shorter
 QUANTILE = 0.99
 PER_WORD = 4  # descriptors of a word, on average, of few descriptors

@@ -13,19 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I32, I64, U32, U64, Bools
 from semloc_logs.numerics.bits import popcount
 from semloc_logs.words.index import ALL, NONE, Allowed, LookUp, Part, may_match
 from semloc_logs.words.segment import Segment
 
-Bools = NDArray[np.bool_]
-I32 = NDArray[np.int32]
-U32 = NDArray[np.uint32]
-U64 = NDArray[np.uint64]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 NEAR_CODE = 14  # bits between codes that vote
 # of a vote with equal codes; other votes weigh (1 - bits / FAR_CODE)^2 of it, in whole numbers:
 # their sums do not depend on their order

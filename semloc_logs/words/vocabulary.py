@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from semloc_logs.arrays import F32
 from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.cells import by_cell
 from semloc_logs.tables.atomic_files import replacing_file
@@ -36,7 +37,6 @@ BITS = 64
 # of the children's coordinates, which int8 holds up to 127 / 256: three times their spread and more
 CHILD_STEP = 2.0**-8
 PER_CELL = 256  # descriptors for each cell that the cells are found from
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import Fit, Step, align
 from semloc_logs.alignment.surface import surface_of
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, rotation_angle
 
-F64 = NDArray[np.float64]
 CELL = 0.4
 STEPS = tuple(Step(radius, 15) for radius in (1.0, 0.5, 0.2))
 SMALL = exp_se3(np.array([0.15, -0.2, 0.1]), np.array([0.03, -0.02, 0.06]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.covariance import (
     COMMON_BIAS,
@@ -16,11 +15,10 @@ from semloc_logs.alignment.covariance import (
 from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit, align
 from semloc_logs.alignment.surface import flattened_surface, surface_of
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.drift import UNMEASURED, Drift
 from semloc_logs.numerics.transforms import apply, exp_se3, yaw_transform
 from tests.alignment.fits import CELL, SMALL, STEPS, fit, room
-
-F64 = NDArray[np.float64]
 
 
 def test_covariance_of_a_room_and_of_a_corridor() -> None:

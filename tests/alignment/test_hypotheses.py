@@ -32,7 +32,7 @@ def slow_pool(
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_votes_are_those_of_a_dictionary(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 60

@@ -6,19 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import Step, Weighting, _add_point, _increment, align
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import fine_fit
 from semloc_logs.alignment.surface import flattened_surface, surface_of
 from semloc_logs.alignment.target_map import point_surface
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
 from tests.alignment.fits import CELL, SMALL, STEPS, error, fit, room
-
-F64 = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(

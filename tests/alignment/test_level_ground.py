@@ -6,16 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.covariance import covariance_of
 from semloc_logs.alignment.icp import Step, align
 from semloc_logs.alignment.level_ground import ground_bias
 from semloc_logs.alignment.surface import surface_of
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import yaw_transform
 from tests.alignment.fits import CELL
-
-F64 = NDArray[np.float64]
 
 
 def ground_and_walls(rng: np.random.Generator, lifted: float, left_only: bool = False) -> F64:

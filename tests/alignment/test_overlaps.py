@@ -115,7 +115,7 @@ def random_map(seed: int) -> BlockMap:
     return blocks_of(voxels)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     yaw=st.floats(0.1, 6.0),
@@ -148,7 +148,7 @@ def test_a_voxel_within_others_is_closest_to_points_in_it(is_full: bool) -> None
     np.testing.assert_array_equal(theirs, [[2.5, 2.5, 2.5]])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), most=st.sampled_from([1, 7, 400]))
 def test_the_best_of_many_are_the_best_by_the_slow_one(seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)
@@ -201,7 +201,7 @@ def test_voxels_that_leave_the_map_do_not_hide_the_others(axis: int) -> None:
     assert [ranked.tau for ranked in best] == [0.5]
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10_000), reach=st.sampled_from([1.3, 4.0, 10.0]))
 def test_masks_have_every_class_that_may_be_closest(seed: int, reach: float) -> None:
     blocks = random_map(seed)

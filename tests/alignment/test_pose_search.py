@@ -136,7 +136,7 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1, 2]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
     """Every turn and shift that is tried, one by one, by look-ups of turned and moved voxels."""
     rng = np.random.default_rng(seed)

@@ -14,8 +14,9 @@ from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
 from semloc_logs.alignment.search import Candidate
 from semloc_logs.alignment.target_map import PLANE_NOISE, UNCERTAIN_RADII, Target
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
-from tests.alignment.voxel_maps import F64, V, block_map, moved, points_of, town
+from tests.alignment.voxel_maps import V, block_map, moved, points_of, town
 
 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])

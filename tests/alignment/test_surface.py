@@ -18,7 +18,7 @@ from semloc_logs.alignment.surface import (
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.2, 0.5, 1.3]), st.sampled_from([0.1, 0.4, 2.0]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_the_nearest_is_that_of_brute_force(seed: int, cell: float, radius: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-2, 2, (150, 3)) + 1e4
@@ -48,7 +48,7 @@ def test_planes_are_made_where_they_are_met() -> None:
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.5, 1.0, 2.0]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_points_around_a_point_are_those_of_brute_force(seed: int, cell: float) -> None:
     """300 points in 4 m: more than enough lie within the rings of cells, whatever the axis."""
     rng = np.random.default_rng(seed)
@@ -99,7 +99,7 @@ def test_points_with_few_around_are_no_planes() -> None:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_flattened_points_lie_on_the_plane_of_a_slow_weighted_fit(seed: int) -> None:
     """A slanted wall seen in a slab: every kept point lies on the plane of the weighted points
     around it.

@@ -49,7 +49,7 @@ def slow_tau(
     st.booleans(),
     st.sampled_from([0.7, 1.5, 5.0]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_tau_is_that_of_brute_force(
     seed: int, yaw: float, t: tuple[float, float, float], coarse: bool, kappa: float
 ) -> None:

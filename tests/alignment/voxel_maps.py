@@ -7,14 +7,13 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.mask_grid import ANY_BIT, MaskGrid, build_mask_grid, class_bits
 from semloc_logs.alignment.query_map import Evidence
+from semloc_logs.arrays import U8
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
 from semloc_logs.voxels.keys import BLOCK, pack
 
 V = 0.5
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
 Cell = tuple[int, ...]
 COARSE = cityscapes().coarse
 

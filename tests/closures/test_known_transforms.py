@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.covariance import stiffness
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.scores import MutualScores, Scores
 from semloc_logs.alignment.search import Candidate
+from semloc_logs.arrays import F64, U8
 from semloc_logs.closures.acceptance.calibration import log_odds, shipped
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment
@@ -53,8 +53,6 @@ from semloc_logs.words.index import Matches
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 Scene = tuple[F64, U8]
 V = 0.3
 ROAD, BUILDING, WALL, POLE, VEGETATION = 0, 2, 3, 5, 8

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.evaluation.map_sharpness import plane_figures, rigidly_at
 from semloc_logs.numerics.transforms import exp_se3
-
-F64 = NDArray[np.float64]
 
 
 def wall(x: float, seed: int) -> F64:

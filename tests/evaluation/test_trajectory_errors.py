@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.evaluation.trajectory_errors import (
     aligned_distances,
     relative_errors,
@@ -16,8 +16,6 @@ from semloc_logs.evaluation.trajectory_errors import (
     rms,
 )
 from semloc_logs.numerics.transforms import exp_se3, transform, translation_quaternion
-
-F64 = NDArray[np.float64]
 
 
 def _line(n: int, step_m: float) -> F64:
@@ -59,7 +57,7 @@ def test_without_values_there_is_no_mean() -> None:
     assert len(metres) == 0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000))
 def test_the_alignment_gives_a_known_transform_back(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -2,13 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
 from semloc_logs.numerics.local_shape import shape
-
-F64 = NDArray[np.float64]
 
 
 def plane(

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.labels.label_check import LabelCheck
 from semloc_logs.labels.space import BUILDING, ROAD, SIDEWALK
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 ORIGIN = np.array([0.0, 0.0, 1.8])
 POLE, CAR = 5, 13
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Camera, Header
 from semloc_logs.labels.painting import PaintedPoints, Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
 from semloc_logs.numerics.transforms import inverse
 
-F64 = NDArray[np.float64]
 HEIGHT, WIDTH, FOCAL = 400, 1200, 700.0
 BOARD, WALL = 1, 2
 UP = np.array([0.0, 0.0, 1.0])

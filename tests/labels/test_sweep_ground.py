@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.labels.sweep_ground import ground_surface
 
-F64 = NDArray[np.float64]
 EYE = np.array([0.0, 0.0, 1.8])
 
 
@@ -85,7 +84,7 @@ def test_no_points_one_point_and_points_far_away() -> None:
     assert np.isfinite(far.height_at(np.array([[1e12, 0.0]]))).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(*[st.floats(-30, 30, width=32)] * 3), min_size=1, max_size=60))
 def test_any_points_give_finite_heights(rows: list[tuple[float, float, float]]) -> None:
     p = np.array(rows)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from semloc_logs.numerics.transforms import Array, translation_quaternion
+from semloc_logs.arrays import F64
+from semloc_logs.numerics.transforms import translation_quaternion
 
 STORES = {"ros2": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -147,7 +148,7 @@ class Recorder:
         self.add(topic, message, stamp_ns)
 
     def transform(
-        self, parent: str, child: str, pose: Array, stamp_ns: int, topic: str = "/tf_static"
+        self, parent: str, child: str, pose: F64, stamp_ns: int, topic: str = "/tf_static"
     ) -> None:
         """A transform ``parent_T_child`` (4, 4)."""
         t, q = translation_quaternion(pose)
@@ -176,7 +177,7 @@ class Recorder:
     def pose(
         self,
         stamp_ns: int,
-        pose: Array,
+        pose: F64,
         *,
         late_ns: int = 0,
         log_time_ns: int | None = None,

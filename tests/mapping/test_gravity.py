@@ -9,9 +9,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import SettingsError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.session.session import Session
@@ -23,7 +23,6 @@ from semloc_logs.mapping.up_evidence import UpEvidence
 from semloc_logs.numerics.transforms import apply, inverse, transform
 from semloc_logs.settings import load
 
-F64 = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 AXES = Rotation.create_group("O").as_matrix()  # the 24 rotations of a cube
 TURNS = [*AXES, *Rotation.random(12, random_state=0).as_matrix()]

@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.mapping.ground import GroundMap, GroundMapper, ground_height, write_ground
 from semloc_logs.tables.table import read_metadata, read_table
-
-F64 = NDArray[np.float64]
 
 
 def hill(xy: F64) -> F64:

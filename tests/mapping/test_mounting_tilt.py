@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.mounting_tilt import straight_way, turn_about_way
 
-F64 = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 # normals of a road and of fronts on both sides, as gravity has them
 ROAD, FRONTS = [Z] * 60, [Y] * 10 + [-Y] * 10

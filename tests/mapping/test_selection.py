@@ -19,7 +19,6 @@ steps = st.lists(st.floats(0, 60, allow_subnormal=False), min_size=1, max_size=2
 
 
 @given(steps, st.floats(0.5, 120), st.sampled_from([0.0, 0.3, 0.5, 0.9]))
-@settings(deadline=None)
 def test_submaps_cover_all_keyframes_and_keep_their_length(
     step: list[float], length: float, overlap: float
 ) -> None:
@@ -59,7 +58,6 @@ def test_a_jump_in_the_road_leaves_no_empty_submaps() -> None:
 
 
 @given(steps, st.floats(0.5, 120), st.sampled_from([0.0, 0.3, 0.5, 0.9]))
-@settings(deadline=None)
 def test_submaps_are_those_of_every_stretch_looked_at(
     step: list[float], length: float, overlap: float
 ) -> None:
@@ -109,7 +107,7 @@ def test_thinning_keeps_the_first_point_of_each_cell() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_thinning_is_what_a_dictionary_says(seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-3, 3, (200, 3)).astype(np.float32)
     first: dict[tuple[int, ...], int] = {}

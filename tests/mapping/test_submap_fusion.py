@@ -27,7 +27,7 @@ ORIGINS = [np.array([0.1, 0.2, 0.3], np.float32)] * N
 
 
 @given(st.floats(0.5, 12.0), st.floats(0.0, 0.8))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_submaps_fused_in_passing_are_those_fused_one_by_one(length: float, overlap: float) -> None:
     ranges = submap_ranges(np.arange(N, dtype=float), length, overlap)
     submaps = list(fuse_ranges(KEYFRAMES, ranges, POSES, ORIGINS, FUSION))

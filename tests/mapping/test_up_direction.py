@@ -9,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import level
 from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.settings import load
 
-F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -14,7 +14,7 @@ def test_by_hand() -> None:
 
 
 @given(st.lists(st.integers(0, 9), max_size=50))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_as_a_stable_sort(cells: list[int]) -> None:
     cell = np.array(cells, np.int32)
     order, start = by_cell(cell, 10)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.eigen import eigen
-
-F64 = NDArray[np.float64]
 
 
 def eigen_all(matrices: F64) -> tuple[F64, F64]:
@@ -55,7 +53,7 @@ def test_equal_eigenvalues(a: F64) -> None:
     np.testing.assert_allclose(vectors[0].T @ vectors[0], np.eye(3), atol=1e-14)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))
 def test_any_matrix_is_put_together_again(upper: list[float]) -> None:
     a = np.zeros((3, 3))

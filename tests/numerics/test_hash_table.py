@@ -13,7 +13,7 @@ def test_half_of_the_places_stay_empty() -> None:
 
 
 @given(st.lists(st.integers(-(2**63) + 1, 2**63 - 1) | st.integers(-4, 4), max_size=200))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_keys_are_found_where_they_were_put(keys: list[int]) -> None:
     table = empty_table(len(keys))
     for key in keys:

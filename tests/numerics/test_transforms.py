@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import (
     apply,
     exp_se3,
@@ -19,7 +19,6 @@ from semloc_logs.numerics.transforms import (
     yaw_transform,
 )
 
-F64 = NDArray[np.float64]
 number = st.floats(-100, 100)
 vector = st.tuples(number, number, number).map(np.array)
 direction = vector.filter(lambda v: np.linalg.norm(v) > 1e-3)
@@ -43,7 +42,6 @@ def by_formula(q: F64) -> F64:
 
 
 @given(vector, quaternion)
-@settings(deadline=None)
 def test_transforms_from_quaternions_and_back(t: F64, q: F64) -> None:
     T = transform(t, q)
     np.testing.assert_allclose(T[:3, :3], by_formula(q), atol=1e-12)
@@ -78,7 +76,6 @@ def test_angles_are_exact_near_zero_and_near_a_half_turn(angle: float) -> None:
 
 
 @given(direction, direction)
-@settings(deadline=None)
 def test_the_rotation_between_two_directions(a: F64, b: F64) -> None:
     R = rotation_between(a, b)
     a = a / np.linalg.norm(a)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.pictures.placement import Tie, fitted, keyframe_near, place_sessions
@@ -16,7 +16,6 @@ from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import SessionFolder, Workspace
 
-F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
 
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.numerics.transforms import exp_se3, interpolate, yaw_transform
@@ -49,7 +49,6 @@ from semloc_logs.stages.report import Report
 from semloc_logs.workspace import Workspace
 from tests.pipeline.fusions import Fuse
 
-F64 = NDArray[np.float64]
 START_NS = 1_760_000_000_123_456_789
 DAY_NS = 86_400_000_000_000
 LANE = 1.8  # m from the middle of the street

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.tables import contracts
@@ -16,7 +16,6 @@ from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
 METADATA = {"schema_version": 1, "voxel_size": 0.3}
 SIDE_M = 100

@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.cli.main import program
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import yaw_transform
 
-F64 = NDArray[np.float64]
 pytest.importorskip("gtsam")
 
 

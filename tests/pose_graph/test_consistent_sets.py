@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.pose_graph.consistent_sets import (
     GATE,
@@ -18,7 +18,6 @@ from semloc_logs.pose_graph.graph import Chain, Loops, PoseGraph
 from semloc_logs.pose_graph.odometry_noise import LEAST_M, LEAST_RAD, REFERENCE_M
 from semloc_logs.settings import Settings
 
-F64 = NDArray[np.float64]
 OPTIMIZE = Settings().resolved().optimize
 STEP = STRETCH * OPTIMIZE.vertex_spacing / 2  # metres between vertices: two in a stretch
 COUNT = 8  # vertices of a session

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
@@ -16,7 +15,6 @@ from semloc_logs.voxels.keys import BLOCK, pack
 from semloc_logs.voxels.store import blocks_path, write_blocks
 
 pytest.importorskip("gtsam")
-I64 = NDArray[np.int64]
 VOXEL = 0.3
 WALL = 2  # Cityscapes building
 CAR = 13

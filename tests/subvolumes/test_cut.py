@@ -26,7 +26,7 @@ def test_codes_of_the_states() -> None:
     st.tuples(st.floats(-12, 12), st.floats(-12, 12), st.floats(-6, 6)),
     st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 9)),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_turning_is_what_the_slow_loop_says(
     seed: int, yaw: float, centre: tuple[float, ...], size: tuple[int, ...]
 ) -> None:

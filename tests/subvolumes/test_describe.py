@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
+from semloc_logs.arrays import U8
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table, turned_map
@@ -33,7 +34,6 @@ from semloc_logs.subvolumes.network import (
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.pairs import occupied
 
-U8 = NDArray[np.uint8]
 LOW = np.array([-64, 32, -16])
 V = 0.3
 

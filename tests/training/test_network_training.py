@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes.cut import SIZE, code_table
@@ -30,7 +30,6 @@ from semloc_logs.training.pairs import (
 )
 from semloc_logs.training.schedule import learning_rate, scene_window
 
-U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
 
 

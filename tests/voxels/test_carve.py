@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.hash_table import EMPTY
 from semloc_logs.voxels.carve import (
     CLASSES,
@@ -27,7 +28,6 @@ from semloc_logs.voxels.carve import (
 
 EDGE = 16
 FREE, HIT = 1, 2
-F64 = NDArray[np.float64]
 Walk = Callable[..., NDArray[np.uint8]]
 
 
@@ -82,9 +82,7 @@ place = st.tuples(*[inside | on_border] * 3)
 
 
 @given(origin=place, end=place)
-@settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_ray_marks_the_cells_that_it_crosses(
     walk: Walk, origin: tuple[float, ...], end: tuple[float, ...]
 ) -> None:
@@ -140,9 +138,7 @@ def test_a_ray_beyond_the_limit_passes_and_does_not_hit(walk: Walk) -> None:
 
 
 @given(rays=st.lists(st.tuples(place, st.booleans()), min_size=1, max_size=20), origin=place)
-@settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_nothing_is_written_outside_the_grid(
     walk: Walk, rays: list[tuple[tuple[float, ...], bool]], origin: tuple[float, ...]
 ) -> None:
@@ -211,7 +207,7 @@ def test_flush_by_hand() -> None:
         max_size=60,
     )
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_votes_are_counted_as_in_a_dictionary(frames: list[tuple[int, int, int]]) -> None:
     table = vote_table(64)
     used = 0

@@ -88,7 +88,7 @@ def same(a: Evidence, b: Evidence) -> bool:
 
 
 @given(st.lists(rows, min_size=1, max_size=5), st.randoms(use_true_random=False))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_merging_is_the_sum_in_any_order_and_grouping(parts: list[Rows], random: object) -> None:
     evidences = [as_evidence(p) for p in parts]
     left = reduce(merge, evidences)

@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.settings import ResolvedFusion, Settings
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.store import write_voxels
 
-F64 = NDArray[np.float64]
 SENSOR = np.array([0.0, 0.0, 1.2])
 # the wall stands across x; cars drive along y before it
 WALL_X = 14.0

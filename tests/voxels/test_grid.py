@@ -198,7 +198,7 @@ def test_votes_do_not_overflow() -> None:
 
 
 @given(st.permutations(range(6)))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_votes_do_not_depend_on_the_order_of_frames(order: list[int]) -> None:
     f = fusion(clamp=(-6.0, 6.0))  # nothing is clamped, so the log-odds add up in any order too
     frames = random_frames(7)

@@ -132,7 +132,7 @@ def files(work: Workspace) -> list[Path]:
         max_size=7,
     )
 )
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_adding_and_removing_is_a_fresh_index(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]
 ) -> None:
@@ -434,7 +434,7 @@ def slow_candidates(
 
 
 @given(st.integers(0, 100), st.integers(1, 400), st.integers(1, 4))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_a_budget_takes_the_nearest_words(seed: int, budget: int, probes: int) -> None:
     d = near_cells(seed, 500)
     queries = near_cells(seed + 1, 6)

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
+from semloc_logs.arrays import F32
 from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.bits import lowest_bit, popcount
 from semloc_logs.words.index import SHORTLIST, Allowed, Index
@@ -26,7 +27,6 @@ from semloc_logs.words.vocabulary import (
     train_vocabulary,
 )
 
-F32 = NDArray[np.float32]
 ALL = Allowed(np.array([True]))
 TOLERANCE = 2.0**-9  # of a similarity: descriptors are rounded to 2^-11
 
@@ -149,7 +149,7 @@ def slow_search(
     st.integers(1, 12),
     st.lists(st.booleans(), min_size=5, max_size=5),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_nearest_words_are_those_of_brute_force(
     seed: int, k: int, probes: int, allow: list[bool]
 ) -> None:
@@ -186,7 +186,7 @@ _counted: Any = njit(_count)
 
 
 @given(st.lists(st.integers(1, 2**64 - 1), min_size=1, max_size=20))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_bits_are_counted(values: list[int]) -> None:
     assert _counted(np.array(values, np.uint64)) == [
         (v.bit_count(), (v & -v).bit_length() - 1) for v in values
@@ -283,7 +283,7 @@ def test_an_empty_centroid_takes_the_point_farthest_from_its_own() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 7), st.integers(1, 4), st.integers(1, 6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_kmeans_is_lloyds_algorithm(seed: int, k: int, dimensions: int, rounds: int) -> None:
     """Beside points one by one; the sums of rounded points are exact in any order."""
     rng = np.random.default_rng(seed)

@@ -10,8 +10,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64
 from semloc_logs.benchmarks.versions import simulation_version
 from semloc_logs.pictures.completion_picture import draw_completions
 from semloc_logs.settings import Resolved
@@ -19,8 +19,6 @@ from semloc_logs.subvolumes.completed import Completed, completed, load_completi
 from semloc_logs.training.pairs import read_shard
 from semloc_logs.training.scene_shards import SceneTask, make_shard
 
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 Figures = dict[str, dict[str, float | str]]
 
 SEEDS = (9001, 9002, 9003, 9004)  # of held-out streets; seeds of training count from 0

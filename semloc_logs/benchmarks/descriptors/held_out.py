@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.benchmarks.descriptors.places import (
     HEADINGS,
     Place,
@@ -46,9 +46,6 @@ from semloc_logs.simulation.town.terrain import Ground
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 # points and sensor (base frame, m), labels, standard deviation of the range
 Cloud = tuple[F32, F32, U8, F32 | None]
 

@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.grid import BlockMap
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 
 HEADINGS = 18  # of the paper: a query comes turned by the nearest of them
 

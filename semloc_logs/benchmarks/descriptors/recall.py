@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, F64, I64, U8
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut
 from semloc_logs.benchmarks.descriptors.places import Place
 from semloc_logs.numerics.transforms import apply
@@ -26,10 +27,6 @@ from semloc_logs.subvolumes.describe import (
 )
 from semloc_logs.subvolumes.network import LATENT
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 # a place and whether it is a query -> centres (voxels of its frame) and descriptors
 Describe = Callable[[Place, bool], Described]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.descriptors.places import Place, Street, map_place, turned_place
 from semloc_logs.closures.query import build_query, query_keyframes, query_members
 from semloc_logs.evaluation.truth import TrueTrack
@@ -21,7 +22,6 @@ from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary
 
-F64 = NDArray[np.float64]
 NEAR = 10.0  # m from the target's road
 FAR = 1e6  # m from every simulated street
 RADIUS = 1.5  # m between a query word's true place and a database word that counts

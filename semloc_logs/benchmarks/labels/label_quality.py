@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import I64, U8
 from semloc_logs.errors import LogError
 from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
@@ -33,8 +34,6 @@ CLASSES = ("ground", "construction", "vegetation", "pole")
 OTHERS = "vehicle or other"
 NONE = "unlabelled"
 
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 Figures = dict[str, dict[str, float | str]]
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.benchmarks.scans import Scan, log_sweeps, town_sweeps
 from semloc_logs.errors import LogError
 from semloc_logs.labels.space import cityscapes
@@ -22,8 +22,6 @@ from semloc_logs.settings import Resolved, ResolvedFusion
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, Fuser
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 Figures = dict[str, dict[str, float | str]]
 
 ROAD, SIDEWALK, BUILDING, VEGETATION, TERRAIN, UNLABELLED = 0, 1, 2, 8, 9, 255

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drive_plan import Plan, Session
 from semloc_logs.simulation.meshes.objects import resample
@@ -26,7 +26,6 @@ from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane
 from semloc_logs.tables.atomic_files import replacing_folder
 
-F64 = NDArray[np.float64]
 SEED = 300
 BLOCK, BEYOND = 60.0, 30.0  # m between streets, and of a street beyond the last crossing
 LABEL_NOISE, DRIFT = 0.12, 0.007  # share of wrong labels; of the odometry, share of the way

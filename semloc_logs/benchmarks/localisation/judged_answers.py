@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.localisation.city import (
     CROSSING,
     DATABASE,
@@ -31,7 +31,6 @@ from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import Resolved
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 NEAR_M = {CROSSING: 10.0}  # of the database's road; elsewhere:
 LANE_M = 5.0
 WINDOW = np.radians(30.0)  # about the heading of the condition

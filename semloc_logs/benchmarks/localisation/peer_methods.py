@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.localisation.city import WorldDrive
 from semloc_logs.benchmarks.localisation.judged_answers import Answer, World, read_world
 from semloc_logs.benchmarks.peers.peer_process import run_peer
@@ -32,7 +33,6 @@ from semloc_logs.settings import Resolved
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.store import read_keyframe
 
-F64 = NDArray[np.float64]
 SECONDS = 3600.0
 CELL = 0.2  # m: points of a cloud are thinned to it
 CANDIDATES, TOLD = 5, 3

@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F64
+
 RINGS, SECTORS, RADIUS = 20, 60, 50.0  # m
 LIFT = 2.0  # m that heights over the ground are raised by, so that they are positive
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, F64
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut, Size, held_out
 from semloc_logs.benchmarks.descriptors.recall import (
     Describe,
@@ -47,8 +48,6 @@ from semloc_logs.words.submap_words import write_words
 from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary
 from semloc_logs.workspace import Workspace
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 Figures = dict[str, dict[str, float | str]]
 LENGTHS = (10, 100, 1000)  # km
 SESSION = 10  # km

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, codes_of, train_vocabulary
 
 Figures = dict[str, dict[str, float | str]]
-F32 = NDArray[np.float32]
 QUERIES = 5000
 BLOCK = 50_000
 NOISE = 0.45  # of a query, in units of the descriptor

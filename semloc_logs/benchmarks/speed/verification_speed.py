@@ -16,13 +16,13 @@ from semloc_logs.alignment.search import search_hypotheses
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.target_map import Target
 from semloc_logs.alignment.tau import tau
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
 Figures = dict[str, dict[str, float | str]]
-F64 = NDArray[np.float64]
 ROAD, BUILDING, POLE, TREE = 0, 2, 5, 8
 TRUTH = np.array([0.6, 5.0, -3.0, 0.2])  # target_T_query of the place: yaw, x, y, z
 

@@ -11,23 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.closures.acceptance.calibration import position_confidence
-from semloc_logs.closures.acceptance.placements import (
-    ARM,
-    FAR,
-    Bools,
-    Pairs,
-    Placed,
-    contradicts_odometry,
-)
+from semloc_logs.closures.acceptance.placements import ARM, FAR, Pairs, Placed, contradicts_odometry
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # m between a place and its copy, at voxels of 0.30 m: nearer ones lie in one view, whose free space
 # tells them apart

@@ -10,14 +10,11 @@ from importlib.resources import files
 from typing import Any, Generic
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf, expit
 
+from semloc_logs.arrays import F64, Bools
 from semloc_logs.closures.closure import Agreement, Columns, Features, Value
 from semloc_logs.settings import STREET_VOXEL
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LEAST_SHARE = 1e-4  # of structure in free space, before its logarithm
 LEAST_ODDS = 1e-9  # probabilities are clipped to it and its complement before their logarithm

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT, SAME_PLACE_VOXELS
+from semloc_logs.arrays import F64, I64
 from semloc_logs.closures.acceptance.ambiguity import ambiguity
 from semloc_logs.closures.acceptance.placements import (
     ARM,
@@ -28,9 +28,6 @@ from semloc_logs.closures.acceptance.placements import (
 from semloc_logs.closures.closure import Agreement
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # constants, not settings: the models in calibration.json were fitted to votes counted with them
 NEAR = 25.0  # m of road from a query to its neighbours, at voxels of 0.30 m

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.closures.acceptance.calibration import (
     EVIDENCE,
     Evidence,
@@ -18,9 +19,6 @@ from semloc_logs.closures.acceptance.calibration import (
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
 from semloc_logs.closures.acceptance.joint_poses import JointPoses, Uncertainty, joint_poses
 from semloc_logs.closures.acceptance.placements import (
-    F64,
-    I64,
-    Bools,
     Placed,
     contradicts_odometry,
     pairs_of,

@@ -13,19 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.closures.acceptance.consistency import NEAR, TURN, TURN_DRIFT, most_apart
 from semloc_logs.closures.acceptance.placements import Pairs, Placed, posed_pairs
 from semloc_logs.closures.closure import Alignments, Columns
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 LIKELY = 0.5  # less probable neighbours may be wrong, and tell nothing
 # share of the variance that neighbours have in common. Of right alignments of simulated stereo

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.closures.acceptance.calibration import Model, probability_of
 from semloc_logs.closures.closure import Alignment, Alignments, Columns
 from semloc_logs.mapping.session_map import SessionMap
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 FAR = 200.0  # m of road, at voxels of 0.30 m: odometry still ties together what lies so far apart
 ARM = 0.015  # of the way: an alignment's error of heading (rad)

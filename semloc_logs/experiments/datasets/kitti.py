@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.experiments.datasets.recording import (
-    F64,
     CameraFiles,
     CloudFile,
     Recording,

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.experiments.datasets.recording import (
-    F64,
     CloudFile,
     Recording,
     Track,

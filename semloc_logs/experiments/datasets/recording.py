@@ -21,14 +21,12 @@ from mcap.writer import Writer as McapFile
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.errors import LogError
 from semloc_logs.simulation.output.drive_messages import Made, RosMessages
 from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.tables.atomic_files import replacing_file
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Event = tuple[int, Made]
 
 LIDAR = "lidar"  # frame of the points

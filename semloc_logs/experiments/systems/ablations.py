@@ -21,6 +21,7 @@ from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
 from semloc_logs.alignment.query_map import Query as QueryMap
 from semloc_logs.alignment.search import Candidate
+from semloc_logs.arrays import F32
 from semloc_logs.benchmarks.localisation.our_method import sweep_words
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
@@ -47,7 +48,6 @@ from semloc_logs.subvolumes.network import Encoder, descriptors
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 from semloc_logs.words.index import Allowed, Matches
 
-F32 = NDArray[np.float32]
 BATCH = 64  # subvolumes that are encoded together
 
 

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.experiments.system import Query, View
 from semloc_logs.numerics.local_shape import shape
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 NORMAL_NEIGHBOURS = 20  # nearest points that make a normal
 
 

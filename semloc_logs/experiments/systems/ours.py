@@ -10,11 +10,11 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs import progress
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place
 from semloc_logs.alignment.search import Candidate
+from semloc_logs.arrays import F64
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
@@ -33,7 +33,6 @@ from semloc_logs.settings import Resolved, Settings
 from semloc_logs.stages.describe import describe
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 QUERY = "query"
 
 

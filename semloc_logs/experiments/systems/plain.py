@@ -26,6 +26,7 @@ from semloc_logs.alignment.overlaps import (
     best_overlaps,
     query_voxels,
 )
+from semloc_logs.arrays import F64
 from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
 from semloc_logs.experiments.system_version import module_version
@@ -48,9 +49,6 @@ from semloc_logs.words.plain_vocabulary import (
     load_plain_vocabulary,
 )
 
-U8 = NDArray[np.uint8]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Variant = Literal["semantic", "geometric"]
 METHOD = "paper"
 SINGLE_LABEL = 2  # of all voxels, in the geometric variant

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import Step, align
 from semloc_logs.alignment.surface import surface_of
+from semloc_logs.arrays import F32, F64
 from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
@@ -29,8 +29,6 @@ from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.local_shape import shape
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 # target points, query points, start of target_T_query -> target_T_query and the score
 Register = Callable[[F64, F64, F64], tuple[F64, float]]
 KEPT_CELL = 0.2  # m: points of a scan are thinned to it

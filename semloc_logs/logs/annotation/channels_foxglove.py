@@ -23,10 +23,11 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.annotation.channels import Kind, NewChannel
 from semloc_logs.logs.annotation.closure_record import ClosureRecord
 from semloc_logs.logs.annotation.markers import Marker, MarkerGroup, Shape
-from semloc_logs.logs.annotation.scene import F64, Cloud, Colour, StampedPose, Transform
+from semloc_logs.logs.annotation.scene import Cloud, Colour, StampedPose, Transform
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 

@@ -10,10 +10,11 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.annotation.channels import Kind, NewChannel
 from semloc_logs.logs.annotation.closure_record import ClosureRecord
 from semloc_logs.logs.annotation.markers import Marker, MarkerGroup, Shape
-from semloc_logs.logs.annotation.scene import F64, Cloud, Colour, StampedPose, Transform
+from semloc_logs.logs.annotation.scene import Cloud, Colour, StampedPose, Transform
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import ContractError
 from semloc_logs.logs.annotation.channels import (
     CLOSURES,
@@ -30,7 +31,7 @@ from semloc_logs.logs.annotation.channels import (
 )
 from semloc_logs.logs.annotation.closure_record import ClosureRecord
 from semloc_logs.logs.annotation.markers import Mark, closure_markers, overview_markers
-from semloc_logs.logs.annotation.scene import F64, NO_SCENE, Scene, StampedPose
+from semloc_logs.logs.annotation.scene import NO_SCENE, Scene, StampedPose
 from semloc_logs.numerics.transforms import inverse
 
 

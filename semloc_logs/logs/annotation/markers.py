@@ -8,7 +8,8 @@ from enum import Enum, auto
 
 import numpy as np
 
-from semloc_logs.logs.annotation.scene import F64, Colour, Drive
+from semloc_logs.arrays import F64
+from semloc_logs.logs.annotation.scene import Colour, Drive
 
 LINES_A_SPHERE = 5  # lines are so many times thinner than a sphere
 NAME_SIZE = 2.0  # height of the name of a drive, in diameters of a sphere

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F64
+
 Colour = tuple[float, float, float, float]  # red, green, blue, opacity from 0 to 1
 
 

@@ -11,17 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.errors import LogError
 from semloc_logs.numerics.transforms import interpolate, yaw_transform
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 COLUMN = 1.0  # m: edge of the columns that ground is found in
 STEP = 0.3  # m: neighbouring columns of one ground differ by less
 HEADROOM = 0.5, 2.0  # m above the ground where a station has no points

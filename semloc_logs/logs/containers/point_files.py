@@ -16,14 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64, U8, U32
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.messages.point_fields import LABELS
 
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
-I64 = NDArray[np.int64]
 Rows = Iterator[tuple[F64, U32 | None]]
 THIN = 0.1  # m: one point is kept of each cube of this edge
 BATCH = 1 << 20  # points that are read at once

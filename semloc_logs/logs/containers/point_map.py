@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import BaseLog
 from semloc_logs.logs.containers.map_stations import Stations, Views, tour
@@ -24,7 +25,6 @@ from semloc_logs.logs.log import MAP_FORMAT, Definition, Message, Section, Strea
 from semloc_logs.logs.problems import ProblemKind
 from semloc_logs.numerics.transforms import apply, inverse, translation_quaternion
 
-F64 = NDArray[np.float64]
 POINTS = "/stations/points"
 ODOMETRY = "/stations/odometry"
 LABEL_SPACE = "/stations/label_space"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from semloc_logs.frames import F32, F64
+from semloc_logs.arrays import F32, F64
 from semloc_logs.logs.inspection import units
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.poses.track import PoseTrack

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import F64, Frame, Header, LidarFrame, PointTimeRemark
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, Header, LidarFrame, PointTimeRemark
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages import livox
 from semloc_logs.logs.messages.definitions import UndecodableError, binary

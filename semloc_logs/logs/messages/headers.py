@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from semloc_logs.frames import F64, Frame, Header
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, Header
 from semloc_logs.logs.log import Clock, Message
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.numerics import transforms

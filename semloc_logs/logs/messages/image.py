@@ -7,16 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import (
-    F64,
-    WHOLE_PICTURE,
-    Camera,
-    DepthFrame,
-    Frame,
-    Header,
-    ImageFrame,
-    Region,
-)
+from semloc_logs.arrays import F64
+from semloc_logs.frames import WHOLE_PICTURE, Camera, DepthFrame, Frame, Header, ImageFrame, Region
 from semloc_logs.logs.messages import image_codecs
 from semloc_logs.logs.messages.definitions import UndecodableError, binary
 from semloc_logs.logs.messages.headers import Convert, foxglove, ros

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32
+from semloc_logs.arrays import F32
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.rvl import decode_rvl
 

@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, F64, PointTimeRemark
+from semloc_logs.arrays import F32, F64
+from semloc_logs.frames import PointTimeRemark
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.point_times import offsets_ns
 

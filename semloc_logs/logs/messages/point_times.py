@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
+from semloc_logs.arrays import F32
+from semloc_logs.frames import LidarFrame, PointTimeRemark
 
 # the points of a sweep are within a second, and within a second of their header
 LONGEST_SWEEP_NS = 1_000_000_000

@@ -8,15 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import (
-    F64,
-    Frame,
-    Header,
-    ImuSample,
-    NavSatSample,
-    PoseSample,
-    TransformSample,
-)
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, Header, ImuSample, NavSatSample, PoseSample, TransformSample
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.headers import (

@@ -10,8 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, Header, PoseSample, TransformSample
+from semloc_logs.frames import Frame, Header, PoseSample, TransformSample
 from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings, matrix
 from semloc_logs.logs.poses.pose_stream import FEWEST, PoseStream

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import F64, NavSatSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import NavSatSample
 from semloc_logs.logs.poses.track import is_time
 
 LEAST_APART_NS = 200_000_000  # their errors are alike for much longer

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F64, ImuSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import ImuSample
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.track import is_time
 

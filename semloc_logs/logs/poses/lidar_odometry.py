@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, LidarFrame
+from semloc_logs.frames import Frame, LidarFrame
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.poses.track import is_time

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from semloc_logs.frames import F64
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import Problem
 from semloc_logs.numerics.transforms import transform

@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.frames import F64, Frame, ImuSample, NavSatSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, ImuSample, NavSatSample
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.poses.track import PoseTrack, is_time
 from semloc_logs.logs.problems import Problem, ProblemKind, Problems

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F64
+from semloc_logs.arrays import F64
 from semloc_logs.logs.messages.stamps import duration, time_range, utc
 from semloc_logs.logs.poses.track import PoseTrack
 

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import PoseSample, TransformSample
 from semloc_logs.logs.poses.publishers import OnePublisher, publisher_of
 from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import Problem, ProblemKind

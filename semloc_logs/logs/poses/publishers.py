@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import PoseSample, TransformSample
 from semloc_logs.logs.poses.tf_tree import MAX_EDGES, Edge, frame_name
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.numerics.transforms import rotation_angle

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from semloc_logs.frames import F32
-from semloc_logs.numerics.transforms import Array, apply, rotation_angle
+from semloc_logs.arrays import F32, F64
+from semloc_logs.numerics.transforms import apply, rotation_angle
 
 _EVERY = 4  # clouds; a vehicle is not looked at more often
 _KEPT, _COMPARED = 20_000, 500  # points of the first cloud, and of each that is compared with it
@@ -36,8 +36,8 @@ class Stop:
     ``shifts`` are distances (m) of clouds that have moved, 0 of others.
     """
 
-    position: Array
-    pose: Array
+    position: F64
+    pose: F64
     first: F32
     start_ns: int
     end_ns: int
@@ -46,13 +46,13 @@ class Stop:
     noise: float = 0.0
     shifts: list[float] = field(default_factory=list)
 
-    def begin(self, pose: Array, points: F32) -> None:
+    def begin(self, pose: F64, points: F32) -> None:
         """Compare from now on with the points (n, 3) of another cloud, in the base frame."""
         self.pose = np.array(pose)
         self.first = _some(points, _KEPT).copy()
         self.tree = None
 
-    def compare(self, points: Array) -> None:
+    def compare(self, points: F64) -> None:
         """Take a later cloud (n, 3), in the session frame."""
         if self.tree is None:
             first = apply(self.pose, self.first)
@@ -86,7 +86,7 @@ class Standstill:
         """How far (m) the surroundings moved in it."""
         return 0.0 if self.worst is None else self.worst.shift
 
-    def add(self, points: F32, session_T_base: Array, stamp_ns: int) -> None:
+    def add(self, points: F32, session_T_base: F64, stamp_ns: int) -> None:
         """Takes the points (n, 3) of a cloud in the base frame.
 
         Clouds of one time have one pose, which tells nothing: a clock may stand still.
@@ -110,12 +110,12 @@ class Standstill:
             stop.compare(apply(session_T_base, _some(points, _COMPARED)))
 
 
-def _is_still(position: Array, pose: Array) -> bool:
+def _is_still(position: F64, pose: F64) -> bool:
     way = np.sort(np.abs(pose[:3, 3] - position))
     return bool(way[1] < STILL and way[2] < _LIFT)
 
 
-def _distance(tree: cKDTree, points: Array) -> float:
+def _distance(tree: cKDTree, points: F64) -> float:
     distances, _ = tree.query(points)
     return float(np.quantile(distances, _QUANTILE))
 

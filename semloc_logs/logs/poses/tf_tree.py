@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from semloc_logs.frames import F64, TransformSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import TransformSample
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics import transforms
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import PoseSample, TransformSample
 from semloc_logs.numerics import transforms
 
 EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: it goes on as it was

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, DepthFrame, Frame, ImageFrame, LidarFrame
+from semloc_logs.frames import DepthFrame, Frame, ImageFrame, LidarFrame
 from semloc_logs.logs.poses.track import is_time
 from semloc_logs.logs.problems import Problem
 from semloc_logs.numerics import transforms

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
+from semloc_logs.frames import Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.messages.image_codecs import METRE, MILLIMETRE, depth_metres
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, WHOLE_PICTURE, Camera
+from semloc_logs.frames import WHOLE_PICTURE, Camera
 
 # share of a picture's side by which a principal point is off its middle at most
 _OFF_MIDDLE = 0.2

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F32, F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F32, F64, Camera
+from semloc_logs.frames import Camera
 from semloc_logs.logs.sensors.picture_calibration import camera_R_rect, fitted_camera, lens_of
 from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F32
 from semloc_logs.logs.sensors.rectification import SMALLEST, Rectification
 
 # px of the matched pictures, where texture is plenty: interpolation, pixel locking, calibration

@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, F64, LidarFrame
+from semloc_logs.arrays import F32, F64
+from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semloc_logs.frames import F32
+from semloc_logs.arrays import F32
 from semloc_logs.logs.problems import ProblemKind, Problems
 
 FEWEST = 10  # pictures that show it for sure; in the first ones a part of the scene may be left out

@@ -6,16 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semloc_logs.frames import (
-    F32,
-    F64,
-    DepthFrame,
-    Header,
-    ImageFrame,
-    LabelForm,
-    LidarFrame,
-    PosedCloud,
-)
+from semloc_logs.arrays import F32, F64
+from semloc_logs.frames import DepthFrame, Header, ImageFrame, LabelForm, LidarFrame, PosedCloud
 from semloc_logs.logs.poses.base_frame import BASE_LINK, BasePoses
 from semloc_logs.logs.poses.standstill import Standstill
 from semloc_logs.logs.poses.tf_tree import frame_name

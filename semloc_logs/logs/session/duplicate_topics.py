@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from scipy.spatial import cKDTree
 
-from semloc_logs.frames import F32
+from semloc_logs.arrays import F32
 from semloc_logs.logs.problems import Problem, ProblemKind
 
 _REMEMBERED = 4  # clouds of all topics that a new one is compared with

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.frames import PoseSample, TransformSample
 from semloc_logs.logs.containers.base import merged_streams
 from semloc_logs.logs.containers.memory import DEFAULT
 from semloc_logs.logs.containers.open import open_log

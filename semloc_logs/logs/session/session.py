@@ -15,8 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError, RoleError
-from semloc_logs.frames import F64, Camera, ImageFrame, LabelNames, PosedCloud
+from semloc_logs.frames import Camera, ImageFrame, LabelNames, PosedCloud
 from semloc_logs.logs.containers.base import merged_streams
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Stream

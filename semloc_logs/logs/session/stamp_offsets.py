@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from semloc_logs.frames import F64, Frame, Header, TransformSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, Header, TransformSample
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.tf_tree import Edge, frame_name
 from semloc_logs.logs.problems import Problem, ProblemKind

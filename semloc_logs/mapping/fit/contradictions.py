@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.mapping.fit.findings import WRONG, Finding, Severity, StreamFit
 from semloc_logs.mapping.fit.keyframe_pairs import (
@@ -24,9 +24,6 @@ from semloc_logs.mapping.fit.model import (
     difference,
     pose_motion,
 )
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # registrations with a smaller share of points on planes may have ended anywhere; a sensor with few
 # lines has so few on planes everywhere, which tell where it brings far more onto them

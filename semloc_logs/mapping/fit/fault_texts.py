@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.fit.clock_drift import ClockDrift
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 
-F64 = NDArray[np.float64]
 OTHER_END = 0.5, 1.5  # of a sweep: an offset may be from its other end
 BENT = 0.5  # of a sweep: in drives of 50 and 130 m offsets of clocks were off by 0.5 of it at most
 MIRRORED = 0.25  # of a shift, by which it differs from twice the mounting it is of

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.fit.clock_drift import ClockDrift, clock_drift
@@ -75,9 +75,6 @@ from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, n
 from semloc_logs.mapping.fit.shared_surfaces import offset_between
 from semloc_logs.mapping.fit.way import other_distance, searched
 from semloc_logs.mapping.keyframes import Collected
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # pairs of a stream: one for so many keyframes, within these bounds; a pair costs about 15 ms
 KEYFRAMES_A_PAIR = 8

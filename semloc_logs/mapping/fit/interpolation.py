@@ -7,13 +7,11 @@ second derivative times the times to both of them; the derivative shows in three
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.logs.poses.track import PoseTrack
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 _FEWEST = 5  # poses that show how the motion changes
 # s: between poses nearer than this no vehicle is far off, and their noise looks like a motion
 _SHORT = 0.3

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Pairs, difference
 from semloc_logs.mapping.fit.plane_cells import (
     Fit,
@@ -22,9 +22,6 @@ from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 # the second keyframe of a pair has moved so far (voxels), or turned so far (rad)
 APART = 6.0

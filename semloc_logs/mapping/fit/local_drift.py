@@ -7,15 +7,14 @@ poses give; what the registration changes is drift, less what both ways differ.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.keyframe_pairs import LEAST_SHARE, Clouds, Registrar, motion
 from semloc_logs.mapping.fit.model import difference
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
 
-F64 = NDArray[np.float64]
 WAY = 40.0  # voxels between both keyframes: about the road of a query
 LONGEST_WAY = 1.5  # of it: where keyframes are sparse, or poses jump
 PAIRS = 16

@@ -15,14 +15,11 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64, Bools
 from semloc_logs.numerics.transforms import inverse
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 # session_T_base (n, 4, 4) at stamps (n,), and which are known (n,)
 PosesAt = Callable[[I64], tuple[F64, Bools]]
 

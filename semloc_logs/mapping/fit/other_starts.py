@@ -10,17 +10,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
 from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written, with_other_axes
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 TRIED = 4  # pairs that show whether another start is better
 MOST_STARTS = 3  # other motions to start registration from

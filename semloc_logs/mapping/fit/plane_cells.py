@@ -14,13 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.eigen import eigen
 from semloc_logs.numerics.hash_table import EMPTY, empty_table, place_of
 from semloc_logs.numerics.local_shape import MOMENTS, add_point, covariance
 from semloc_logs.numerics.transforms import exp_se3
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 LEAST_POINTS = 5  # of a cell with a plane
 THIN = 0.3  # a plane is thinner than this share of its width

@@ -10,15 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, Bools
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
-from semloc_logs.mapping.fit.model import Bools, Pairs, PosesAt, cost_of, scatter
+from semloc_logs.mapping.fit.model import Pairs, PosesAt, cost_of, scatter
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse, yaw_transform
-
-F64 = NDArray[np.float64]
 
 FAR_OFF = 40.0  # squared distances in the median beyond which far readings are tried
 MUCH_NEARER = 0.05  # a far reading explains the pairs when it lowers the median to this share

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.fit.findings import LEAST_PAIRS, LEAST_SIGMAS, NEAR_VOXELS, WRONG
 from semloc_logs.mapping.fit.keyframe_pairs import (
     Clouds,
@@ -31,8 +31,6 @@ from semloc_logs.mapping.fit.model import (
 from semloc_logs.mapping.fit.way import BETTER
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import exp_se3
-
-F64 = NDArray[np.float64]
 
 PAIRS = 24
 LONGEST_NS = 500_000_000  # between the clouds of a pair

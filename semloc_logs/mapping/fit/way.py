@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.fit.keyframe_pairs import (
     Clouds,
     Registered,
@@ -22,8 +22,6 @@ from semloc_logs.mapping.fit.keyframe_pairs import (
 )
 from semloc_logs.mapping.fit.model import Pairs
 from semloc_logs.numerics.evenly import evenly
-
-F64 = NDArray[np.float64]
 
 TRIED = 6  # pairs that show the distance together
 FEWEST = 3

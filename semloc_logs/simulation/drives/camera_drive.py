@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.traffic import Traffic
 from semloc_logs.simulation.drives.trajectory import Trajectory
-from semloc_logs.simulation.meshes.world import F64, Scene, World
+from semloc_logs.simulation.meshes.world import Scene, World
 from semloc_logs.simulation.sensors.camera import (
     CAMERAS,
     CameraModel,
@@ -29,8 +29,6 @@ from semloc_logs.simulation.sensors.label_errors import corrupt_labels
 from semloc_logs.simulation.sensors.rendered_images import Painter
 from semloc_logs.simulation.sensors.sensor import Sensor
 
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 SKY = 10  # Cityscapes train id
 _SHIFT = 2.0  # px by which masks miss edges at a share of 0.1 of wrong labels
 

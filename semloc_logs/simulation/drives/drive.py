@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.drives.traffic import Traffic
 from semloc_logs.simulation.drives.trajectory import Trajectory
-from semloc_logs.simulation.meshes.world import F64, Scene, World
+from semloc_logs.simulation.meshes.world import Scene, World
 from semloc_logs.simulation.sensors.label_errors import corrupt_labels
 from semloc_logs.simulation.sensors.lidar import Sweep, SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.drives.trajectory import poses_along
 from semloc_logs.simulation.meshes import objects
-from semloc_logs.simulation.meshes.world import F64, Mesh, MeshBuilder, Scene
+from semloc_logs.simulation.meshes.world import Mesh, MeshBuilder, Scene
 from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.terrain import Ground
 

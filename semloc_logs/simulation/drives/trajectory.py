@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.meshes.world import F64
 
 POSES_HZ = 20.0  # of a trajectory
 START_NS = 1_760_000_000_000_000_000  # of the first drive

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.transforms import interpolate
 from semloc_logs.numerics.wgs84 import E2, SEMI_MAJOR
 from semloc_logs.simulation.drives.trajectory import Trajectory
-from semloc_logs.simulation.meshes.world import F64
-
-I64 = NDArray[np.int64]
 
 GRAVITY = 9.80665  # m/s^2
 ANTENNA = np.array([-0.6, 0.0, 1.5])  # in the base frame (m)

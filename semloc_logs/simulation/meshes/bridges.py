@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.objects import Parts
 from semloc_logs.simulation.meshes.world import (
-    F64,
     FENCE,
     ROAD,
     TERRAIN,

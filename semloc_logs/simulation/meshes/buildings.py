@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes import facades, landmarks, roofs
 from semloc_logs.simulation.meshes.facades import FOOT, Openings
 from semloc_logs.simulation.meshes.greenery import ivy
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, joined
-from semloc_logs.simulation.meshes.world import BUILDING, F64, Mesh, cylinder, place
+from semloc_logs.simulation.meshes.world import BUILDING, Mesh, cylinder, place
 
 ROOF_SHARES = {
     "gable": (

@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Rng, boxes, grid, joined, loft
-from semloc_logs.simulation.meshes.world import F64, Mesh, cylinder, place, quads
+from semloc_logs.simulation.meshes.world import Mesh, cylinder, place, quads
 
 FOOT = -1.5  # m; walls reach into the ground, which slopes
 

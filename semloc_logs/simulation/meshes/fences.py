@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, joined, resample, tubes
-from semloc_logs.simulation.meshes.world import F64, FENCE, WALL, Mesh, ribbon, upright_quads
+from semloc_logs.simulation.meshes.world import FENCE, WALL, Mesh, ribbon, upright_quads
 
 FENCES = ("picket", "board", "rails", "bars", "mesh", "lattice", "gabions")
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, joined, tubes, wheels
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
-    F64,
     FENCE,
     PERSON,
     POLE,

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, joined, resample, triangles_of, tubes
 from semloc_logs.simulation.meshes.trees import leaves, twigs
-from semloc_logs.simulation.meshes.world import F64, VEGETATION, Mesh, ribbon
+from semloc_logs.simulation.meshes.world import VEGETATION, Mesh, ribbon
 
 
 def bush(rng: Rng, *, bare: bool = False) -> Parts:

@@ -8,8 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Rng, boxes, joined, loft, triangles_of
-from semloc_logs.simulation.meshes.world import F64, Mesh, gabled_roof, place
+from semloc_logs.simulation.meshes.world import Mesh, gabled_roof, place
 
 Rectangle = tuple[float, float, float, float]
 STEEPEST = 8.0  # m that a roof rises at most

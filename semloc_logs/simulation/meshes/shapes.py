@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.meshes.world import BUILDING, CAR, F64, I64, WALL, Mesh, cylinder, place
+from semloc_logs.arrays import F64, I64
+from semloc_logs.simulation.meshes.world import BUILDING, CAR, WALL, Mesh, cylinder, place
 
 # meshes about the foot of a thing, each with its Cityscapes train id
 Parts = list[tuple[Mesh, int]]

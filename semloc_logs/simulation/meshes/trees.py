@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, joined, triangles_of, tubes
-from semloc_logs.simulation.meshes.world import F64, VEGETATION, Mesh
+from semloc_logs.simulation.meshes.world import VEGETATION, Mesh
 
 LEAF_AREA = 0.26  # mean area of a loose triangle whose corners lie within +-1, of :func:`leaves`
 

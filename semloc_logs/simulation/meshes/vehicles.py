@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, body, boxes, joined, tubes, wheels
 from semloc_logs.simulation.meshes.world import (
     BICYCLE,
     BUS,
     CAR,
-    F64,
     MOTORCYCLE,
     RIDER,
     TRAIN,

@@ -15,10 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.errors import SemlocError
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 ROAD, SIDEWALK, BUILDING, WALL, FENCE, POLE, TRAFFIC_LIGHT, TRAFFIC_SIGN, VEGETATION, TERRAIN = (
     range(10)

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import SemlocError
 from semloc_logs.simulation.drives.camera_drive import CameraShot
-from semloc_logs.simulation.meshes.world import F64
 from semloc_logs.simulation.output.drive_messages import Made, Messages, antenna
 
 LEFT, RIGHT, ONLY = "camera_left_optical", "camera_right_optical", "camera_optical"  # frame ids

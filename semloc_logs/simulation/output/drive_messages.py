@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.simulation.drives.drive import TURN_NS, DriveFrame
 from semloc_logs.simulation.drives.vehicle_sensors import ANTENNA
-from semloc_logs.simulation.meshes.world import F64
 
 LABEL_SPACE = "cityscapes"
 LATCHED = ("/tf_static", "/lidar/label_space", "/camera/label_space")

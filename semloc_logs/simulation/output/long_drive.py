@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting
 from semloc_logs.simulation.drives.trajectory import START_NS, Trajectory, poses_along, smooth_line
-from semloc_logs.simulation.meshes.world import F64, Scene
+from semloc_logs.simulation.meshes.world import Scene
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.sensors.lidar import Sweep, SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.tables.atomic_files import replacing_file
-
-F64 = NDArray[np.float64]
 
 
 def write_truth(path: Path, stamps_ns: NDArray[np.int64], world_T_base: F64) -> None:

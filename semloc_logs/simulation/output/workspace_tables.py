@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import semloc_logs
+from semloc_logs.arrays import F64
 from semloc_logs.closures.alignment_tables import alignment_table
 from semloc_logs.closures.closure import (
     Agreement,
@@ -33,7 +34,6 @@ from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 
-F64 = NDArray[np.float64]
 VOXEL = 0.3  # m
 SPEED = 8.0  # m/s
 EVERY = 1.0  # m between keyframes

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I64, U8
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
     CAR,
-    F64,
     ROAD,
     SIDEWALK,
     UNLABELLED,
@@ -29,10 +29,6 @@ from semloc_logs.simulation.meshes.world import (
     WALL,
     Scene,
 )
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 
 MOUNT_AHEAD = 0.3  # m before the base frame's origin, over the front axle
 

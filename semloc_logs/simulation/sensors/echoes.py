@@ -10,11 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.meshes.world import BUILDING, CAR, F64, ROAD, SIDEWALK, VEGETATION
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
+from semloc_logs.arrays import F32, F64, I64, U8
+from semloc_logs.simulation.meshes.world import BUILDING, CAR, ROAD, SIDEWALK, VEGETATION
 
 # share of the light of 905 nm that comes back from a surface of each class that faces the sensor
 _REFLECTANCE = np.full(256, 0.3)

@@ -7,9 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.simulation.sensors.echoes import hash_cells
-
-U8 = NDArray[np.uint8]
 
 # what a labelling network takes a class for when it is wrong
 CONFUSIONS: dict[int, tuple[int, ...]] = {

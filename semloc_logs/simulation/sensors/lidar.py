@@ -10,13 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.numerics.transforms import interpolate
-from semloc_logs.simulation.meshes.world import F64, Scene
+from semloc_logs.simulation.meshes.world import Scene
 from semloc_logs.simulation.sensors.echoes import beyond_edges, is_heard, mixed_ranges, reflectance
 from semloc_logs.simulation.sensors.lidar_models import LidarModel, beam_directions, is_blocked
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

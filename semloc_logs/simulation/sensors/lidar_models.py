@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from semloc_logs.arrays import F32, F64
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
+from semloc_logs.arrays import F32, I64
+
 Real = NDArray[np.floating] | float
 
 

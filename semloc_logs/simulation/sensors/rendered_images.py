@@ -10,15 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.meshes.world import F64, ROAD, Scene
+from semloc_logs.simulation.meshes.world import ROAD, Scene
 from semloc_logs.simulation.sensors.camera import CameraModel, Hits, first_hits, pixel_rays
 from semloc_logs.simulation.sensors.noise import Octaves, octaves
 from semloc_logs.simulation.sensors.surface_colours import Surfaces, markings, road_plan, surfaces
 from semloc_logs.simulation.sensors.texture import Pixels, colours
 
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 _HAZE = 700.0  # m that take away two thirds of the contrast
 _BLUR = 0.5  # px of the lens
 _NOISE = 1.6  # grey levels of 255 in the middle tones

@@ -10,11 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.meshes.world import F64, ROAD, VEGETATION, World
+from semloc_logs.arrays import F32, F64, I32
+from semloc_logs.simulation.meshes.world import ROAD, VEGETATION, World
 
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
-U8 = NDArray[np.uint8]
 _PLAN_CELL = 0.25  # m
 _MOST_CELLS = 8_000_000
 

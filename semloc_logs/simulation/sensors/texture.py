@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, I64, U8
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
     CAR,
@@ -42,10 +43,6 @@ from semloc_logs.simulation.sensors.noise import (
     within,
 )
 from semloc_logs.simulation.sensors.surface_colours import Surfaces
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes import objects
 from semloc_logs.simulation.meshes.shapes import walls_within
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
-    F64,
     FENCE,
     POLE,
     ROAD,

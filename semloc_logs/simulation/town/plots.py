@@ -8,10 +8,11 @@ from functools import partial
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes import objects
 from semloc_logs.simulation.meshes.buildings import building
 from semloc_logs.simulation.meshes.objects import Parts
-from semloc_logs.simulation.meshes.world import F64, Mesh
+from semloc_logs.simulation.meshes.world import Mesh
 from semloc_logs.simulation.town.setting import Rng, Setting
 from semloc_logs.simulation.town.sides import Side, Style
 from semloc_logs.simulation.town.works import scaffolding, shell

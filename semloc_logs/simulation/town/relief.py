@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from semloc_logs.simulation.meshes.world import F64
+from semloc_logs.arrays import F64
 
 _CELL = 3.0  # m
 _SCALES = (160.0, 40.0, 12.0, 5.0)  # m, widths of the Gaussian weights

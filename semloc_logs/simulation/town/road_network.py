@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.meshes.world import F64
 
 Rng = np.random.Generator
 

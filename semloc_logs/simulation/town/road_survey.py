@@ -14,10 +14,10 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile, read_trajectory
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.meshes.world import F64
 from semloc_logs.simulation.town.road_network import (
     Road,
     RoadNetwork,

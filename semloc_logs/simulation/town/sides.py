@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semloc_logs.simulation.meshes.world import F64
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.town.road_network import Road
 
 Rng = np.random.Generator

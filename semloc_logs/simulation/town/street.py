@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.meshes.world import F64, World, join_worlds
+from semloc_logs.simulation.meshes.world import World, join_worlds
 from semloc_logs.simulation.town.backlands import backlands, islands, put_bridge, railway
 from semloc_logs.simulation.town.kerbs import kerbside
 from semloc_logs.simulation.town.plots import plots

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.simulation.meshes.world import F64, ROAD, SIDEWALK, TERRAIN, Mesh
+from semloc_logs.arrays import F64
+from semloc_logs.simulation.meshes.world import ROAD, SIDEWALK, TERRAIN, Mesh
 from semloc_logs.simulation.town.relief import Relief
 from semloc_logs.simulation.town.road_network import RoadNetwork
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.simulation.meshes import objects
 from semloc_logs.simulation.meshes.objects import Parts
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
-    F64,
     FENCE,
     POLE,
     TERRAIN,

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import pose_matrix, same_place, yaw_between
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit
@@ -17,12 +16,12 @@ from semloc_logs.alignment.search import search_hypotheses
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.target_map import FINE_RADII
 from semloc_logs.alignment.tau import tau
+from semloc_logs.arrays import F64
 from semloc_logs.benchmarks.speed.verification_speed import TRUTH, Scene, scene
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
-F64 = NDArray[np.float64]
 KAPPA = 3.0
 
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.calibration import Calibration, Model, log_odds
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment, Closure, Features, Rejected
@@ -17,7 +17,6 @@ from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import Settings
 
-F64 = NDArray[np.float64]
 Outcome = Closure | Rejected
 SETTINGS = Settings().resolved()
 MAP = yaw_transform(0.7, (40.0, -20.0, 1.0))  # target map from query map

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.calibration import (
     EVIDENCE,
     VOTES,
@@ -27,8 +27,6 @@ from semloc_logs.closures.acceptance.calibration import (
 from semloc_logs.closures.closure import FEATURES, Agreement, Features
 from semloc_logs.closures.closure_tables import AGREEMENT_COLUMNS
 from semloc_logs.tables import contracts
-
-F64 = NDArray[np.float64]
 
 GOOD = Features(
     structure=0.95,

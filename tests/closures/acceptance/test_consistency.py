@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.consistency import (
     MIN_VOTE,
     MOST_SLACK,
@@ -38,7 +39,6 @@ from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL
 from tests.closures.acceptance.known_alignments import (
     COPIED,
-    F64,
     MAP,
     MAPS,
     MODEL,
@@ -119,7 +119,7 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_sessions_that_do_not_meet_a_pair_change_nothing_of_it(seed: int, others: int) -> None:
     """Sessions elsewhere, and improbable alignments of the pair's queries in them."""
     rng = np.random.default_rng(seed)
@@ -267,7 +267,7 @@ def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> N
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 0.05]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_voters_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
     """Alignments of a bent road, right, moved, turned or in other places, as many as three of a
     query, against the slow count.

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.joint_poses import (
     COMMON,
     JointPoses,
@@ -19,7 +20,7 @@ from semloc_logs.closures.acceptance.joint_poses import (
 from semloc_logs.closures.acceptance.placements import Placed, pairs_of
 from semloc_logs.closures.closure import Alignments
 from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
-from tests.closures.acceptance.known_alignments import F64, MAP, MAPS, alignment
+from tests.closures.acceptance.known_alignments import MAP, MAPS, alignment
 
 SIGMA = 0.3  # m
 TURN = 0.01  # rad

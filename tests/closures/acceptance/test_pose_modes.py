@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.consistency import place_odds
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.acceptance.placements import pairs_of, place
@@ -17,7 +18,6 @@ from semloc_logs.mapping.drift import UNMEASURED
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from tests.closures.acceptance.known_alignments import (
-    F64,
     MAP,
     MAPS,
     MODEL,

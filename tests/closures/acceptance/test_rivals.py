@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.closures.acceptance.consistency import _sums, place_odds
 from semloc_logs.closures.acceptance.placements import Placed, pairs_of
 from semloc_logs.numerics.transforms import yaw_transform
-from tests.closures.acceptance.known_alignments import F64
 
 
 def two_alignments(

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from semloc_logs.arrays import F64
 from semloc_logs.experiments.system import Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.shapes.training_views import Training
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import Settings
 
-F64 = NDArray[np.float64]
 SENSOR = np.array([0.0, 0.0, 1.8])
 ROAD, BUILDING = 0, 2
 INTRINSICS = np.array([[180.0, 0.0, 160.0], [0.0, 180.0, 80.0], [0.0, 0.0, 1.0]])

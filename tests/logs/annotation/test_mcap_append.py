@@ -501,7 +501,7 @@ def test_a_damaged_chunk_is_refused_when_it_has_to_be_read(tmp_path: Path) -> No
 
 
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_damaged_bytes_give_a_log_error_or_a_result(data: st.DataObject) -> None:
     file = io.BytesIO()
     writer = Writer(

@@ -32,7 +32,7 @@ from semloc_logs.logs.problems import Problem, Problems, sentences
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
-HURRY = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+HURRY = settings(max_examples=15, suppress_health_check=list(HealthCheck))
 
 
 def ros_messages(store: Any) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.map_stations import (
     FIRST_NS,
@@ -17,8 +17,6 @@ from semloc_logs.logs.containers.map_stations import (
     Views,
     tour,
 )
-
-F64 = NDArray[np.float64]
 
 
 def plane(x: F64, y: F64, z: F64) -> F64:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__LaserScan as LaserScan
 
-from semloc_logs.frames import F64
+from semloc_logs.arrays import F64
 from semloc_logs.logs.inspection import units
 from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.inspection.inspect_text import WIDTH, inspect_text

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from semloc_logs.arrays import F64
 from semloc_logs.cli.main import program
 from semloc_logs.errors import RoleError
 from semloc_logs.frames import LidarFrame, PointTimeRemark
@@ -28,7 +29,7 @@ from semloc_logs.logs.roles import find_roles, guess_roles
 from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.logs.session.tally import Tally
 from semloc_logs.numerics import transforms
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -40,11 +41,11 @@ MOUNTS = {
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
-def rows(points: Array) -> NDArray[np.void]:
+def rows(points: F64) -> NDArray[np.void]:
     return np.ascontiguousarray(points, np.float32).view(XYZ).reshape(-1)
 
 
-def half_room(world_T_sensor: Array, ahead: float, seed: int) -> Array:
+def half_room(world_T_sensor: F64, ahead: float, seed: int) -> F64:
     """Points (n, 3) of the walls on one side, ``ahead`` 1 or -1, in the sensor frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (6000, 3)) * HALF
@@ -76,7 +77,7 @@ def drive(log: Any, *, mounts: tuple[str, ...] = ("front", "rear")) -> Path:
 @pytest.mark.parametrize("kind", ["ros2", "ros1", "protobuf"])
 def test_two_lidars_see_one_room(recorder: Any, kind: str) -> None:
     session = open_session([drive(recorder(kind))])
-    seen: dict[str, list[Array]] = {}
+    seen: dict[str, list[F64]] = {}
     for cloud in session.clouds():
         assert cloud.session_T_base is not None
         seen.setdefault(cloud.header.topic, []).append(
@@ -124,9 +125,7 @@ def test_a_missing_extrinsic_costs_one_lidar_and_one_sentence(recorder: Any) -> 
     )
 
 
-def publish_twice(
-    log: Any, change: Callable[[Array], Array], name: str, frame: str = "front"
-) -> Path:
+def publish_twice(log: Any, change: Callable[[F64], F64], name: str, frame: str = "front") -> Path:
     log.transform("base_link", "front", MOUNTS["front"], EPOCH - S)
     for k in range(-10, 40):
         log.pose(EPOCH + k * S // 20, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
@@ -138,11 +137,11 @@ def publish_twice(
     return Path(log.write())
 
 
-def without_ground(points: Array) -> Array:
+def without_ground(points: F64) -> F64:
     return points[points[:, 2] > -1.0]
 
 
-def centroids(points: Array) -> Array:
+def centroids(points: F64) -> F64:
     cells = np.floor(points / 0.3).astype(np.int64)
     _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), 3))
@@ -161,7 +160,7 @@ def centroids(points: Array) -> Array:
     ids=["no ground", "thinned", "voxels", "in the base frame"],
 )
 def test_one_lidar_twice_is_used_once(
-    recorder: Any, change: Callable[[Array], Array], frame: str
+    recorder: Any, change: Callable[[F64], F64], frame: str
 ) -> None:
     path = publish_twice(recorder(), change, "/segmented_or_not", frame)
     session = open_session([path])
@@ -183,7 +182,7 @@ def test_a_filtered_topic_by_its_name(recorder: Any) -> None:
 
 
 def test_two_sensors_in_one_frame_are_both_used(recorder: Any) -> None:
-    def other(points: Array) -> Array:
+    def other(points: F64) -> F64:
         return points + np.random.default_rng(len(points)).normal(0, 0.02, points.shape)
 
     session = open_session([publish_twice(recorder(), other, "/second")])

@@ -12,16 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import (
-    F64,
-    Frame,
-    Header,
-    LidarFrame,
-    NavSatSample,
-    PoseSample,
-    TransformSample,
-)
+from semloc_logs.frames import Frame, Header, LidarFrame, NavSatSample, PoseSample, TransformSample
 from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.poses import lidar_odometry
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Frame, Header, ImuSample, NavSatSample
 from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.poses.navsat import LocalFrame, NavSatPoses, earth_centred
 from semloc_logs.logs.problems import sentences

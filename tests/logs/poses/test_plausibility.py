@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
-F64 = NDArray[np.float64]
 STEP_NS = 50_000_000
 
 

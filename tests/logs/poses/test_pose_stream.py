@@ -13,12 +13,13 @@ from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import RoleError
 from semloc_logs.frames import PosedCloud
 from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
-from semloc_logs.numerics.transforms import Array, translation_quaternion, yaw_transform
+from semloc_logs.numerics.transforms import translation_quaternion, yaw_transform
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -29,7 +30,7 @@ FAR = 40.0  # m, between the poses of two streams
 Recorder = Callable[..., Any]
 
 
-def forward(seconds: float, offset: float = 0.0) -> Array:
+def forward(seconds: float, offset: float = 0.0) -> F64:
     return yaw_transform(0.0, (seconds + offset, 0.0, 0.0))
 
 
@@ -43,7 +44,7 @@ def drive(recorder: Recorder, kind: str = "ros2", frame_id: str = "base_link") -
     return log
 
 
-def stamped(log: Any, topic: str, time_ns: int, pose: Array) -> None:
+def stamped(log: Any, topic: str, time_ns: int, pose: F64) -> None:
     """A PoseStamped."""
     t, q = translation_quaternion(pose)
     where = log.make(

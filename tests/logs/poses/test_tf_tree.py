@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Header, TransformSample
 from semloc_logs.logs.poses.tf_tree import TransformTree
 from semloc_logs.numerics import transforms
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 
 
 def edge(
-    parent: str, child: str, pose: Array, stamp_ns: int = 0, *, static: bool = True
+    parent: str, child: str, pose: F64, stamp_ns: int = 0, *, static: bool = True
 ) -> TransformSample:
     return TransformSample(Header("/tf", stamp_ns, stamp_ns, parent), child, pose, static)
 

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Header, PoseSample
 from semloc_logs.logs.poses.track import PoseTrack
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -24,7 +25,7 @@ def track(*seconds: float, max_gap: float = 1.0) -> PoseTrack:
     return made
 
 
-def pose_at(poses: PoseTrack, seconds: float) -> Array | None:
+def pose_at(poses: PoseTrack, seconds: float) -> F64 | None:
     return poses.at(EPOCH + round(seconds * S))
 
 
@@ -61,7 +62,7 @@ def test_the_motion_goes_on_at_the_ends(seconds: float) -> None:
     np.testing.assert_allclose(pose, on_circle(seconds), atol=1e-3)
 
 
-def on_circle(seconds: float) -> Array:
+def on_circle(seconds: float) -> F64:
     angle = 0.1 * seconds
     return yaw_transform(angle, (20.0 * np.sin(angle), 20.0 * (1.0 - np.cos(angle)), 0.0))
 
@@ -197,7 +198,7 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         assert poses.append(stamp, pose)
     limit = poses.gap_limit_ns()
 
-    def between(t: int) -> Array | None:
+    def between(t: int) -> F64 | None:
         """The pose at a stamp between the ends."""
         k = max(int(np.searchsorted(stamps, t)), 1)
         if not stamps[0] <= t <= stamps[-1]:
@@ -210,7 +211,7 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) 
         pose[:3, 3] = (1 - w) * positions[k - 1] + w * positions[k]
         return pose
 
-    def speeds(target: Array, source: Array, seconds: float) -> Array:
+    def speeds(target: F64, source: F64, seconds: float) -> F64:
         """Velocity (3,) and the rotation (9,) of a step."""
         step = np.linalg.inv(source) @ target
         return np.concatenate([step[:3, 3] / seconds, step[:3, :3].ravel()])

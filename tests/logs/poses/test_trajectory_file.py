@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, Header, LidarFrame
+from semloc_logs.frames import Frame, Header, LidarFrame
 from semloc_logs.logs.poses.trajectory_file import (
     FilePoses,
     Trajectory,

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.messages.point_times import offsets_ns
 from semloc_logs.logs.problems import lost, sentences
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.numerics import transforms
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S + 123_456_789
@@ -26,14 +27,14 @@ BASE_T_LIDAR = yaw_transform(0.4, (1.0, 0.3, 1.2))
 SWEEPS = 4
 
 
-def pose(seconds: float) -> Array:
+def pose(seconds: float) -> F64:
     """15 m/s and 0.5 rad/s: a circle of 30 m that passes the middle of the room."""
     a = 0.5 * seconds
     return yaw_transform(a, (30.0 * np.sin(a) - 3.0, 30.0 * (1 - np.cos(a)) - 1.0, 0.0))
 
 
 @cache
-def skewed(start: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+def skewed(start: float) -> tuple[F64, NDArray[np.int64], NDArray[np.int64]]:
     """Points (n, 3) in the moving sensor, times in ns since the start, and rings; firing order."""
     turn = np.repeat(np.arange(COLUMNS) / COLUMNS, RINGS)
     ring = np.tile(np.arange(RINGS), COLUMNS)
@@ -60,7 +61,7 @@ def skewed(start: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
     return points, offset, ring
 
 
-def off_the_walls(points: Array) -> float:
+def off_the_walls(points: F64) -> float:
     """Largest distance of points (n, 3) in the room from a wall, without the worst 0.1 %."""
     return float(np.quantile(np.min(np.abs(HALF - np.abs(points)), axis=1), 0.999))
 

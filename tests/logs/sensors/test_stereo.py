@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Camera, Header
+from semloc_logs.frames import Camera, Header
 from semloc_logs.logs.sensors.rectification import Rectification, bouguet_rotations, rectification
 from semloc_logs.logs.sensors.stereo import StereoMatcher, disparity_noise
 from semloc_logs.numerics.transforms import exp_se3, inverse

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
+from semloc_logs.arrays import F64
+from semloc_logs.frames import Camera, Header, ImageFrame, PosedCloud
 from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import NoCloud, lost, sentences

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Header, LidarFrame
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.sensors.sweeps import deskew, sweep_in_base
 from semloc_logs.numerics import transforms
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 STAMP = 1_700_000_000 * S
 BASE_T_SENSOR = yaw_transform(0.3, (1.0, 0.2, 1.5))
 
 
-def pose(seconds: float) -> Array:
+def pose(seconds: float) -> F64:
     """15 m/s in a bend of 0.5 rad/s."""
     return yaw_transform(0.5 * seconds, (15.0 * seconds, 0.4 * seconds, 0.0))
 
@@ -29,11 +30,11 @@ def track(first: float = -0.2, last: float = 0.31) -> PoseTrack:
     return made
 
 
-def world_points(n: int = 500) -> Array:
+def world_points(n: int = 500) -> F64:
     return np.random.default_rng(3).uniform(-40, 40, (n, 3))
 
 
-def measured(world: Array, offset_ns: NDArray[np.int64]) -> Array:
+def measured(world: F64, offset_ns: NDArray[np.int64]) -> F64:
     """What a moving sensor sees of resting points, point by point."""
     seen = [
         transforms.apply(transforms.inverse(pose(o * 1e-9) @ BASE_T_SENSOR), p[None])[0]

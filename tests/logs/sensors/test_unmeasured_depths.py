@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32
 from semloc_logs.logs.problems import sentences
 from semloc_logs.logs.sensors.unmeasured_depths import FEWEST, UnmeasuredDepths
 
-F32 = NDArray[np.float32]
 TOPIC = "/depth"
 
 

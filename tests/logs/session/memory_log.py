@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import (
     Camera,
     DepthFrame,
@@ -20,7 +21,7 @@ from semloc_logs.frames import (
 )
 from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.problems import Problem
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 
@@ -97,12 +98,12 @@ def odometry(
     )
 
 
-def static(parent: str, child: str, pose: Array, seconds: float = 0.0) -> TransformSample:
+def static(parent: str, child: str, pose: F64, seconds: float = 0.0) -> TransformSample:
     return TransformSample(header("/tf_static", seconds, parent), child, pose, static=True)
 
 
 def moving(
-    parent: str, child: str, seconds: float, pose: Array, late: float = 0.0
+    parent: str, child: str, seconds: float, pose: F64, late: float = 0.0
 ) -> TransformSample:
     return TransformSample(header("/tf", seconds, parent, late), child, pose, static=False)
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.engines import Serial
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
 from semloc_logs.logs.session.lent_transforms import lent_transforms
 from semloc_logs.logs.session.session import SessionOptions, open_session
-from semloc_logs.numerics.transforms import Array, yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput
@@ -36,7 +37,7 @@ def part(recorder: Callable[..., Any]) -> Part:
     """Writes a short log; ``mount``: base_T_lidar in /tf_static at ``seconds``, or none."""
 
     def write(
-        name: str, mount: Array | None, *, seconds: float = 0.0, parent: str = "base_link"
+        name: str, mount: F64 | None, *, seconds: float = 0.0, parent: str = "base_link"
     ) -> Path:
         log = recorder("ros2", name)
         if mount is not None:
@@ -53,7 +54,7 @@ def part(recorder: Callable[..., Any]) -> Part:
     return write
 
 
-def first_cloud(path: Path, *others: Path) -> tuple[Array, list[str]]:
+def first_cloud(path: Path, *others: Path) -> tuple[F64, list[str]]:
     """The origin of the first cloud in the base frame, and the problems."""
     mountings = lent_transforms([path], others, {}, None)
     session = open_session([path], SessionOptions(mountings=mountings))

@@ -8,15 +8,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 
-F64 = NDArray[np.float64]
 VOXEL = 0.3
 TOPIC = "/points"
 SECOND = 1_000_000_000

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.mountings import matrix
 from semloc_logs.mapping.fit import fit_check
 from semloc_logs.mapping.fit.fault_texts import corrected
@@ -28,7 +28,6 @@ from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle, ya
 from semloc_logs.settings import load
 from semloc_logs.stages.log_check import check_log
 
-F64 = NDArray[np.float64]
 TOPIC = "/points"  # of the drives
 Check = Callable[..., StreamFit]
 

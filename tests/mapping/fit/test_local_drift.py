@@ -8,15 +8,14 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.findings import SessionFit, StreamFit
 from semloc_logs.mapping.fit.local_drift import PAIRS, apart, drift_of, local_drift
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
 
-F64 = NDArray[np.float64]
 SPREAD = np.array([0.05, 0.02, 0.01, 0.001, 0.002, 0.004])  # m and rad over 10 m
 RATES = SPREAD / 10.0
 

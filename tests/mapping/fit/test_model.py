@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Pairs, agree_about_scale, scatter
 from semloc_logs.numerics.transforms import yaw_transform
-
-F64 = NDArray[np.float64]
 
 
 def _poses_at(stamps_ns: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:

@@ -6,14 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.mapping.fit.model import Pairs, cost_of, pose_motion
 from semloc_logs.mapping.fit.readings import near_reading
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
-F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
 END = 12.0  # s; of the poses
 SIGMAS = np.diag([0.02, 0.02, 0.02, 0.005, 0.005, 0.005]) ** 2

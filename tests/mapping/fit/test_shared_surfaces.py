@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.mapping.fit import fit_check
@@ -16,8 +16,6 @@ from semloc_logs.mapping.fit.findings import StreamFit
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.fit.shared_surfaces import NO_OFFSET, Offset, offset_between
 from semloc_logs.numerics.transforms import apply, exp_se3
-
-F64 = NDArray[np.float64]
 
 
 def second_sensor(

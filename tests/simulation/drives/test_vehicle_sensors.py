@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semloc_logs.arrays import F64
 from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.drives.trajectory import (
@@ -22,7 +23,6 @@ from semloc_logs.simulation.drives.vehicle_sensors import (
     geodetic,
     inertial,
 )
-from semloc_logs.simulation.meshes.world import F64
 
 PERFECT = VehicleSensors(force_noise=0.0, force_bias=0.0, rate_noise=0.0, rate_bias=0.0)
 

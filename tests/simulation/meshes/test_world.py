@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import SemlocError
 from semloc_logs.simulation.meshes.world import (
     Mesh,
@@ -25,8 +26,6 @@ from semloc_logs.simulation.meshes.world import (
     place,
     ribbon,
 )
-
-F64 = NDArray[np.float64]
 
 
 def volume(mesh: Mesh) -> float:

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, Scene, World, box
 from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
@@ -11,7 +12,6 @@ from semloc_logs.simulation.sensors.rendered_images import Painter
 from semloc_logs.simulation.sensors.surface_colours import road_plan, surfaces
 from semloc_logs.simulation.town.street import build_street
 
-U8 = NDArray[np.uint8]
 STEREO = CAMERAS["stereo"]
 PATH = np.column_stack([np.arange(0.0, 160.0), np.zeros(160)])
 

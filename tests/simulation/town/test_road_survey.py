@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64
 from semloc_logs.errors import LogError, SettingsError
 from semloc_logs.simulation.drive_plan import Route, Town, plan_sessions
 from semloc_logs.simulation.drives.trajectory import poses_along
@@ -20,8 +20,6 @@ from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.simulation.town.road_network import RoadNetwork
 from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane, read_drive
 from semloc_logs.simulation.town.street import build_street, street_ground
-
-F64 = NDArray[np.float64]
 
 
 def eight(radius: float = 50.0, slope: float = 0.0) -> F64:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.local_features import (
     DENSE_STEP,
@@ -26,9 +26,6 @@ from semloc_logs.experiments.systems.pictures.picture_matching import (
 )
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 WORDS = 128
 DIMENSIONS = 4096
 TRAINING_FEATURES = 200_000  # that the words are made of, at most

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.local_features import root_sift, unit_descriptors
@@ -28,9 +28,6 @@ from semloc_logs.experiments.systems.pictures.picture_pose import (
 )
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 CELL = 0.04  # m: a pixel of the view from above
 AHEAD, ACROSS = (2.0, 22.0), (-10.0, 10.0)  # m: what it shows, from the vehicle
 STEEPEST = np.cos(np.radians(15.0))  # of the ground's normal against the vertical of the base

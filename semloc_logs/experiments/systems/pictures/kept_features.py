@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import U8
 from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import Picture
 from semloc_logs.experiments.system_version import module_version
@@ -16,7 +16,6 @@ from semloc_logs.experiments.systems.pictures import local_features, picture_pos
 from semloc_logs.experiments.systems.pictures.local_features import Features
 from semloc_logs.experiments.systems.pictures.picture_pose import points_of
 
-U8 = NDArray[np.uint8]
 Extract = Callable[[U8], Features]  # a function with a name of its own
 
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
+from semloc_logs.arrays import F32, U8
+
 LAYERS = 3  # scales in an octave
 PEAK = 0.02  # OpenCV divides it by the layers
 EDGE = 10.0

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.kept_features import Extract, kept_features
@@ -25,9 +26,6 @@ from semloc_logs.experiments.systems.pictures.picture_pose import (
 from semloc_logs.experiments.systems.pictures.visual_index import VisualIndex
 from semloc_logs.words.vocabulary import train_vocabulary
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 VERIFIED = 30  # top retrievals that are verified
 TRAINING_FEATURES = 1_000_000  # that the vocabulary is trained on, at most
 LEAST_FEATURES = 256  # that a vocabulary needs

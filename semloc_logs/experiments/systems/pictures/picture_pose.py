@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.experiments.system import Picture
 from semloc_logs.numerics.cells import by_cell
 from semloc_logs.numerics.transforms import inverse
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor (Lowe 2004)
 SAME_PLACE = 4.0  # pixels between two features of one place
 LEAST_INLIERS = 15

@@ -14,18 +14,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semloc_logs.arrays import F64, U8
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.trained_networks import key_of, trained
 from semloc_logs.numerics.transforms import transform, translation_quaternion
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 WIDTH, HEIGHT = 160, 64  # pixels that pictures are scaled to
 CHANNELS = (16, 32, 64, 96)
 POOLED = (2, 5)

@@ -16,18 +16,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from semloc_logs.arrays import F32, F64, U8
 from semloc_logs.experiments.system import Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.pictures.picture_pose import base_pose, pose_of_points
 from semloc_logs.experiments.systems.trained_networks import key_of, trained
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 WIDTH = 320  # pixels that wider pictures are scaled to
 CELL = 8  # pixels between coordinates
 CHANNELS = (16, 32, 64, 128)

@@ -8,18 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I64, U64
 from semloc_logs.numerics.bits import popcount
 from semloc_logs.numerics.cells import by_cell
 from semloc_logs.words.index import look_ups
 from semloc_logs.words.vocabulary import BITS, Vocabulary
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-I32 = NDArray[np.int32]
-U64 = NDArray[np.uint64]
 WORDS = 2**16
 CELLS = 2  # nearest cells of the vocabulary that a feature of a query looks into
 FARTHEST = 24  # bits: codes that differ in more do not match

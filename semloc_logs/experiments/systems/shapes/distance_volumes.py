@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.experiments.system import View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, view_map
@@ -33,9 +33,6 @@ from semloc_logs.experiments.systems.trained_networks import trained
 from semloc_logs.numerics.transforms import turned_about_z
 from semloc_logs.settings import Resolved
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 EDGE = 30  # voxels of a subvolume
 FIRST = (EDGE - STRIDE) // 2  # voxels from its corner to the cell that holds its keypoint
 TRUNCATED = 5  # voxels: distances beyond are one

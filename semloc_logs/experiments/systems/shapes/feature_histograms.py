@@ -6,13 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.experiments.systems.shapes.near_points import Cells, cells_of, neighbours
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 BINS = 11  # of each of the three angles
 SIZE = 3 * BINS
 SUM = 100.0  # of the bins of each angle

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from semloc_logs.arrays import F64, I64
 from semloc_logs.numerics.cells import by_cell
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 # the order of points by cells, where each cell starts, the cell (n, 3) of each point, and the
 # number of cells along each axis (3,): a plain tuple, which compiled functions pass on
 Cells = tuple[I64, I64, I64, I64]

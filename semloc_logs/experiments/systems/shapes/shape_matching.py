@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.experiments.kept_files import kept_file
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, query_map
@@ -30,9 +31,6 @@ from semloc_logs.words.vocabulary import (
     train_vocabulary,
 )
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 HEADINGS = 18  # of the paper
 STRIDE = 8  # voxels between keypoints
 TRAINING_KEYPOINTS = 200_000  # that a vocabulary is trained on, at most

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import nn
 from torch.nn import functional as F
 
+from semloc_logs.arrays import F32, F64, I64
 from semloc_logs.experiments.system import View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, view_map
@@ -37,9 +37,6 @@ from semloc_logs.numerics.eigen import eigen
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import SIZE as SUBVOLUME
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 RADIAL, ELEVATION, AZIMUTH = 17, 11, 12
 SIZE = RADIAL * ELEVATION * AZIMUTH
 LEAST_RADIUS = 0.1  # of the first border of the radius, in units of the radius

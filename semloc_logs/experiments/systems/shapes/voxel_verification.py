@@ -14,20 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from semloc_logs.alignment.cell_masks import overlap_map
 from semloc_logs.alignment.hypotheses import non_maximum_suppression, pose_matrix
 from semloc_logs.alignment.overlaps import Voxels, overlap, query_voxels
+from semloc_logs.arrays import F64, U8
 from semloc_logs.experiments.system import MOST_POSES
 from semloc_logs.experiments.systems.level_maps import LevelMap
 from semloc_logs.experiments.systems.plain import refined
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U8 = NDArray[np.uint8]
 TILE = 96  # voxels along the edge of the parts that distances are computed in
 FEW, MANY = 64, 1500  # query voxels that rate all hypotheses, and the best
 BEST = 2000  # hypotheses that are rated with many voxels
