@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from semloc_logs.arrays import F64
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.geometry_labels import NoLabels
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.session.session import Session, open_session
@@ -35,7 +35,7 @@ from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected, collect
 from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
-from semloc_logs.settings import Labels, load
+from semloc_logs.settings import load
 
 SIZES: dict[str, Sequence[float]] = {
     "clock offset (s)": (0.02, 0.05, 0.1, 0.2, 0.4, 0.8),
@@ -68,7 +68,7 @@ def read(log: Path, assignments: dict[str, str], folder: Path) -> Drive:
     options = reading_options(settings, {})
     begun = time.process_time()
     with closing(open_session([log], options)) as session:
-        labeller = Labeller(Labels(source="uniform"), session)
+        labeller = NoLabels()
         collected = collect(session, labeller, fusion, folder, log.stem)
         return _first_stream(log, session, collected, fusion.voxel_size, begun)
 

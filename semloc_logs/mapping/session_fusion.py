@@ -14,6 +14,7 @@ from typing import Any
 
 import semloc_logs
 from semloc_logs.errors import LogError
+from semloc_logs.labels.label_sources import labeller_of
 from semloc_logs.labels.labeller import KeyframeView, Labeller
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
@@ -72,7 +73,7 @@ def fuse_session(
     LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
     """
     with closing(_opened(task)) as session:
-        labeller = Labeller(task.settings.labels, session)
+        labeller = labeller_of(task.settings.labels, session)
         fused = _fused(task, session, labeller)
         _write_trajectory(task.folder, session, fused.metadata)
         problems = sorted_problems([*session.problems, *fused.problems, *labeller.problems])

@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.geometry_labels import NoLabels
 from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.mapping.fit.findings import SessionFit
@@ -16,7 +16,7 @@ from semloc_logs.mapping.fit.fit_check import check_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import level
 from semloc_logs.mapping.session_fusion import reading_options
-from semloc_logs.settings import Labels, Settings
+from semloc_logs.settings import Settings
 
 
 def check_log(log: Path, settings: Settings, topics: Mapping[str, str]) -> SessionFit:
@@ -25,7 +25,7 @@ def check_log(log: Path, settings: Settings, topics: Mapping[str, str]) -> Sessi
     fusion = resolved.fusion
     options = reading_options(resolved, topics)
     with closing(open_session([log], options)) as session, tempfile.TemporaryDirectory() as folder:
-        labeller = Labeller(Labels(source="uniform"), session)
+        labeller = NoLabels()
         collected = collect(session, labeller, fusion, Path(folder), log.name)
         check = check_session(session, collected, fusion.voxel_size)
         if check.fits and len(collected):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import onnx
@@ -24,12 +24,14 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
+from semloc_logs.labels.label_sources import LABELLERS, labeller_of
 from semloc_logs.labels.labeller import KeyframeView, Labeller
 from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.problems import Problem, sentences
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Labels
+from semloc_logs.settings.sections import LabelSource
 
 MS = 1_000_000
 ROAD, BUILDING, POLE, CAR = 0, 2, 5, 13
@@ -122,7 +124,7 @@ def halves(
 def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], Labeller]:
     """Classes of the points of every cloud, and their labeller."""
     session = Session([FakeLog(frames)])
-    labeller = Labeller(Labels(**settings), session)
+    labeller = labeller_of(Labels(**settings), session)
     taken = [
         (labeller.take(c, np.arange(len(c.points))), c.points)
         for c in session.clouds(labeller.on_image, labeller.images)
@@ -326,7 +328,7 @@ def test_painted_points_have_the_number_of_their_camera() -> None:
         halves(0, 13, 13, "/rear/labels", "rear"),
     ]
     session = Session([FakeLog(frames)])
-    labeller = Labeller(Labels(), session)
+    labeller = labeller_of(Labels(), session)
     assert labeller.images == ("/cam/labels", "/rear/labels")
     [cloud] = session.clouds(labeller.on_image, labeller.images)
     painted = labeller.take(cloud, np.array([0, 2]))
@@ -398,7 +400,7 @@ def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Pat
         SessionOptions(min_range=0.9, max_range=80.0),
     )
     try:
-        labeller = Labeller(Labels(**settings), session)
+        labeller = labeller_of(Labels(**settings), session)
         clouds = session.clouds(labeller.on_image, labeller.images)
         cloud = next(clouds)
         ids = labeller.take(cloud, np.arange(len(cloud.points)))
@@ -412,3 +414,14 @@ def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Pat
     content = labeller.to_json()["points"]
     assert 14_000 < content["in_a_picture"] < 18_000
     assert 0.6 < content["painted"] / content["in_a_picture"] < 1.0
+
+
+def test_every_source_of_the_settings_has_a_labeller() -> None:
+    assert set(LABELLERS) == set(get_args(LabelSource))
+
+
+def test_a_space_that_is_missing_costs_no_pass_over_the_log() -> None:
+    session = Session([FakeLog([sweep(10, [1])])])
+    for source in LABELLERS:
+        with pytest.raises(SettingsError, match="nowhere"):
+            labeller_of(Labels(source=source, space="nowhere.yaml"), session)

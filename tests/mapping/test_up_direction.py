@@ -103,7 +103,7 @@ def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]
     for name in ("basement_a.mcap", "basement_b.bag"):
         scratch = Path(tempfile.mkdtemp())
         try:
-            from semloc_logs.labels.labeller import Labeller
+            from semloc_logs.labels.label_sources import labeller_of
             from semloc_logs.logs.session.session import SessionOptions, open_session
 
             session = open_session(
@@ -112,7 +112,7 @@ def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]
             try:
                 collected = collect(
                     session,
-                    Labeller(settings.labels, session),
+                    labeller_of(settings.labels, session),
                     settings.fusion,
                     scratch,
                     name,

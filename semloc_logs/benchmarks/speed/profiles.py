@@ -16,7 +16,7 @@ from semloc_logs.benchmarks.fused_sessions import fuse_sessions
 from semloc_logs.benchmarks.spans import FunctionTimes, Rows, Span, span_seconds
 from semloc_logs.benchmarks.speed.fusion_memory import PEAKS_PER_MB
 from semloc_logs.engines import make_engine
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.recorded_labels import RecordedLabels
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.annotation.annotate import content_fingerprint
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
@@ -49,7 +49,7 @@ SPANS = (  # of fusing
     Span("direction of gravity", (level,)),
     Span("ground", (ground_height, ground_surface, GroundMapper.add, GroundMapper.finish)),
     Span("check of poses", (check_session,)),
-    Span("labels", (Labeller.labels, Labeller.take, Labeller.conclude)),
+    Span("labels", (RecordedLabels.labels, RecordedLabels.take, RecordedLabels.conclude)),
     Span("keyframes written", (keep_keyframes,), pulled=map_tables),
     Span("integrate", (Fuser.take, Carver.marks)),
     Span("finish of maps", (Fuser.finish,)),
