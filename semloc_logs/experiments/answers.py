@@ -24,6 +24,7 @@ from semloc_logs.experiments.views import ViewStore
 from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.stages.inputs import fingerprint_of
 from semloc_logs.tables import contracts
+from semloc_logs.tables.metadata import SCHEMA_VERSION
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import POSE, pose_columns
 
@@ -179,7 +180,7 @@ class _Parts:
         number = len(_files(self.folder, self.trial.name))
         path = self.folder / f"{self.trial.name}-{number:04d}.parquet"
         metadata = {
-            "schema_version": 1,
+            "schema_version": SCHEMA_VERSION,
             "made_from": self._made_from,
             "fit_cpu_s": self.fit.cpu_s,
             "kept_cpu_s": self.fit.kept_s,

@@ -6,12 +6,11 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-import semloc_logs
 from semloc_logs.arrays import F64, U8
 from semloc_logs.experiments.system import View
 from semloc_logs.frames import Header, PosedCloud
@@ -22,6 +21,7 @@ from semloc_logs.mapping.map_tables import LevelSession, write_map
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Resolved
+from semloc_logs.tables.metadata import map_metadata
 from semloc_logs.tables.table import write_json
 from semloc_logs.workspace import SessionFolder
 
@@ -78,14 +78,7 @@ def fuse_views(
         world_T_base = np.array([pose for pose in collected.poses if pose is not None])
         world_T_map = np.eye(4)
         world_T_map[:3, 3] = world_T_base[0, :3, 3]
-        metadata: dict[str, Any] = {
-            "schema_version": 1,
-            "voxel_size": fusion.voxel_size,
-            "session_T_map": world_T_map.tolist(),
-            "label_space": "cityscapes",
-            "label_source": "log",
-            "version": semloc_logs.__version__,
-        }
+        metadata = map_metadata(fusion.voxel_size, world_T_map, "log")
         session = LevelSession(
             folder.name,
             collected,

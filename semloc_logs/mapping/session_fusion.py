@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import semloc_logs
 from semloc_logs.errors import LogError
 from semloc_logs.labels.label_sources import labeller_of
 from semloc_logs.labels.labeller import KeyframeView, Labeller
@@ -30,6 +29,7 @@ from semloc_logs.mapping.map_tables import LevelSession, write_map
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.tables import contracts
+from semloc_logs.tables.metadata import map_metadata
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import SessionFolder
@@ -155,14 +155,7 @@ def _fused(task: FuseTask, session: Session, labeller: Labeller) -> _Fused:
             return KeyframeView(apply(map_T, points), origin, labels, is_posed)
 
         labeller.conclude(view, fusion.voxel_size / STREET_VOXEL)
-        metadata = {
-            "schema_version": 1,
-            "voxel_size": fusion.voxel_size,
-            "session_T_map": levelled.session_T_map.tolist(),
-            "label_space": "cityscapes",
-            "label_source": labeller.source,
-            "version": semloc_logs.__version__,
-        }
+        metadata = map_metadata(fusion.voxel_size, levelled.session_T_map, labeller.source)
         keyframes = LevelSession(
             task.folder.name, collected, labeller, map_T_base, fusion, metadata
         )

@@ -11,7 +11,6 @@ import pyarrow.compute as pc
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-import semloc_logs
 from semloc_logs.arrays import I64
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
@@ -31,6 +30,7 @@ from semloc_logs.progress import report as report_progress
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.lock import one_writer
+from semloc_logs.tables.metadata import origin
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.workspace import Workspace
 
@@ -85,8 +85,7 @@ def optimise(
     groups = _groups(sessions, closures, settings, covariances=covariances)
     earlier = None if overwrite else read_earlier(work)
     metadata = {
-        "schema_version": 1,
-        "version": semloc_logs.__version__,
+        **origin(),
         "settings": settings.model_dump(mode="json", include={"optimize"}),
     }
     tables = []
@@ -122,8 +121,7 @@ def merge_maps(work: Workspace) -> list[MergedFrame]:
     for done, (frame, sessions) in enumerate(sorted(frames.items())):
         _check_one_voxel_size(sessions)
         metadata = {
-            "schema_version": 1,
-            "version": semloc_logs.__version__,
+            **origin(),
             "voxel_size": sessions[0].json["voxel_size"],
             "frame": frame,
             "sessions": [session.folder.name for session in sessions],

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-import semloc_logs
 from semloc_logs import progress
 from semloc_logs.closures.exclusions import Exclusions
 from semloc_logs.closures.query import query_keyframes
@@ -32,6 +31,7 @@ from semloc_logs.stages.describe import check_settings, is_described, words_fing
 from semloc_logs.stages.inputs import fingerprint_of
 from semloc_logs.stages.state import OF_DECISION
 from semloc_logs.subvolumes.submap_descriptors import variants_for
+from semloc_logs.tables.metadata import map_metadata
 from semloc_logs.workspace import Workspace
 
 QUERIES_A_TASK = 8  # or more, as tasks hold whole blocks
@@ -222,14 +222,8 @@ class PairSearch:
 
 def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any]:
     """The metadata that tables about some sessions share."""
-    return {
-        "schema_version": 1,
-        "voxel_size": settings.fusion.voxel_size,
-        "session_T_map": np.eye(4).tolist(),
-        "label_space": "cityscapes",
-        "label_source": ",".join(sorted({m.label_source for m in maps})),
-        "version": semloc_logs.__version__,
-    }
+    sources = ",".join(sorted({m.label_source for m in maps}))
+    return map_metadata(settings.fusion.voxel_size, np.eye(4), sources)
 
 
 def pair_fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import semloc_logs
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import TABLE_SECTIONS, Resolved, Settings, validated
+from semloc_logs.tables.metadata import origin
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
@@ -79,8 +79,7 @@ def keep(work: Workspace, settings: Resolved, *, overwrite: bool = False) -> Non
     all of them. The settings of maps stay as the first session has them, unless ``overwrite``.
     """
     content: dict[str, Any] = {
-        "schema_version": 1,
-        "version": semloc_logs.__version__,
+        **origin(),
         "given": settings.differences(),
         "settings": settings.tables(*TABLE_SECTIONS),
     }

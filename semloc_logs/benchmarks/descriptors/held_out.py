@@ -43,6 +43,7 @@ from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.simulation.town.terrain import Ground
+from semloc_logs.tables.metadata import SCHEMA_VERSION
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
@@ -120,7 +121,7 @@ def held_out(
     extent = size.extent
     folder = folder / simulation_version()
     note = {
-        "schema_version": 1,
+        "schema_version": SCHEMA_VERSION,
         "fusion": settings.fingerprint("fusion"),
         "headings": HEADINGS,
         "extent": repr(extent),

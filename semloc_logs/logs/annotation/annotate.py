@@ -59,6 +59,7 @@ from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite_file import side_files
 from semloc_logs.logs.remote import RemotePath, is_remote, uploading
 from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.metadata import SCHEMA_VERSION
 
 __all__ = [
     "AnnotateReport",
@@ -122,7 +123,11 @@ class Results:
         run = self.run_id
         channels, messages = self.encoded(facts)
         own = {f"setting.{key}": value for key, value in sorted(self.settings.items())}
-        own |= {"version": __version__, "schema_version": "1", "session": self.session}
+        own |= {
+            "version": __version__,
+            "schema_version": str(SCHEMA_VERSION),
+            "session": self.session,
+        }
         plan = plan_append(end, channels, messages, f"{METADATA_PREFIX}{run}", own)
         size = len(plan.new_tail)
         return plan, self.report(output, facts, messages, size, replaced=end.replaces)

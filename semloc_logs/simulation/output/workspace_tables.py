@@ -30,6 +30,7 @@ from semloc_logs.numerics.transforms import exp_se3, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.drives.trajectory import DAY_NS, START_NS
 from semloc_logs.tables import contracts
+from semloc_logs.tables.metadata import map_metadata
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
@@ -104,14 +105,7 @@ def write_tables(work: Workspace, plan: TablesPlan, names: tuple[str, ...] = ())
 
 
 def _metadata() -> dict[str, object]:
-    return {
-        "schema_version": 1,
-        "voxel_size": VOXEL,
-        "session_T_map": np.eye(4).tolist(),
-        "label_space": "cityscapes",
-        "label_source": "log",
-        "version": semloc_logs.__version__,
-    }
+    return map_metadata(VOXEL, np.eye(4), "log")
 
 
 # -- sessions
