@@ -142,18 +142,48 @@ class Workspace:
     def failures(self) -> list[Path]:
         return sorted((self.path / "failed").glob("*.json"))
 
+    @property
+    def all_alignments(self) -> Path:
+        """The folder of the alignments of all pairs of sessions."""
+        return self.path / "alignments"
+
     def alignments(self, query: str, target: str) -> Path:
         """The alignments of one session's queries in another."""
-        folder = self.path / "alignments" / f"query={query}" / f"target={target}"
+        folder = self.alignments_of_query(query) / f"target={target}"
         return folder / "alignments.parquet"
+
+    def alignments_of_query(self, query: str) -> Path:
+        """The folder of the alignments of one session's queries."""
+        return self.all_alignments / f"query={query}"
+
+    def alignments_in_target(self, target: str) -> list[Path]:
+        """The folders of the alignments in one session, with or without a table."""
+        return sorted(self.all_alignments.glob(f"query=*/target={glob.escape(target)}"))
+
+    def aligned_pairs(self) -> list[tuple[str, str]]:
+        """Query and target sessions of the pairs whose alignments are there, by name."""
+        files = self.all_alignments.glob("query=*/target=*/alignments.parquet")
+        ends = ((path.parent.parent, path.parent) for path in files)
+        return sorted(
+            (query.name.partition("=")[2], target.name.partition("=")[2]) for query, target in ends
+        )
+
+    @property
+    def all_search_parts(self) -> Path:
+        """The folder of the searches that are not over, one for each query session."""
+        return self.path / ".parts"
 
     def search_parts(self, query: str, target: str | None = None) -> Path:
         """Alignments of a session whose search is not over, a file for each task.
 
         With a ``target``, of a search in it alone.
         """
-        folder = self.path / ".parts" / query
+        folder = self.all_search_parts / query
         return folder if target is None else folder / f"target={target}"
+
+    def segments(self, variant: str) -> Path:
+        """The folder of the index of words of a variant of the descriptor."""
+        return self.path / "index" / variant
 
     @property
     def closures(self) -> Path:

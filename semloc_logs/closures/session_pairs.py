@@ -54,10 +54,7 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
 def known_pairs(work: Workspace) -> dict[Pair, str]:
     """The pairs whose alignments are there, with the fingerprints of what they were made from."""
     pairs: dict[Pair, str] = {}
-    for path in (work.path / "alignments").glob("query=*/target=*/alignments.parquet"):
-        query, target = (
-            folder.name.partition("=")[2] for folder in (path.parent.parent, path.parent)
-        )
+    for query, target in work.aligned_pairs():
         pairs |= known_pair(work, Pair(query, target))
     return pairs
 

@@ -103,7 +103,7 @@ def _optimised(work: Workspace, session: SessionMap) -> tuple[F64 | None, str]:
 
     None where the file is missing or is of an earlier log.
     """
-    path = work.path / "optimized" / f"{session.folder.name}.parquet"
+    path = work.optimized_trajectory(session.folder.name)
     if not path.exists() or not session.posed:
         return None, ""
     table = read_table(path)

@@ -146,5 +146,5 @@ def _left_behind(work: Workspace) -> Iterator[Finding]:
     for path in work.failures():
         reason = str(read_json(path).get("reason"))
         yield Finding(path, reason, "semloc run LOG... --retry-failed")
-    for path in sorted((work.path / ".parts").glob("*")):
+    for path in sorted(work.all_search_parts.glob("*")):
         yield Finding(path, "a search was interrupted", f"semloc close -w {work.path}")

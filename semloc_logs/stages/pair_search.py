@@ -194,7 +194,7 @@ class PairSearch:
         open_searches = {
             p.query for p, made_from in self.fingerprints.items() if self.known.get(p) != made_from
         }
-        for folder in (self.work.path / ".parts").glob("*"):
+        for folder in self.work.all_search_parts.glob("*"):
             if folder.name not in open_searches:
                 shutil.rmtree(folder, ignore_errors=True)
 

@@ -65,7 +65,7 @@ def _outcomes(
 
 def _refused(work: Workspace) -> dict[Key, str]:
     """Closures that the optimisation refused, with the reason."""
-    path = work.path / "optimized" / "graph" / "closures.parquet"
+    path = work.graph_closures
     if not path.exists():
         return {}
     return {key_of(row): row["reason"] for row in read_closures(path) if not row["kept"]}

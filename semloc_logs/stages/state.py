@@ -102,7 +102,7 @@ def _bound_sections(work: Workspace) -> set[str]:
     bound: set[str] = set()
     if any(folder.words_json.exists() for folder in work.sessions()):
         bound |= {*OF_MAPS, "descriptor"}
-    if work.closures.exists() or any((work.path / "alignments").glob("*/*/*.parquet")):
+    if work.closures.exists() or work.aligned_pairs():
         bound |= {"query", "closures"}
     return bound
 

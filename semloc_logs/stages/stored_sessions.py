@@ -91,7 +91,7 @@ def rename_session(work: Workspace, name: str, new_name: str) -> None:
         make_folder(new.parent)
         os.replace(old, new)
         sync_folder(new.parent)
-    shutil.rmtree(work.path / "alignments" / f"query={name}", ignore_errors=True)
+    shutil.rmtree(work.alignments_of_query(name), ignore_errors=True)
     _clear_targets(work, name)
     work.session_lock(name).unlink(missing_ok=True)
     _decide(work)
@@ -123,8 +123,8 @@ def _decide(work: Workspace) -> None:
 
 
 def _clear_targets(work: Workspace, name: str) -> None:
-    for folder in (work.path / "alignments").glob("query=*"):
-        shutil.rmtree(folder / f"target={name}", ignore_errors=True)
+    for folder in work.alignments_in_target(name):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _closure_counts(work: Workspace) -> dict[str, int]:

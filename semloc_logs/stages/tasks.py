@@ -79,7 +79,7 @@ def list_tasks(
             return [StageTask(stage, *task) for task in zip(names, inputs, done, strict=True)]
         case Stage.DECIDE:
             is_done = is_decided(work, settings)
-            return [StageTask(stage, (), (str(work.path / "alignments"),), is_done)]
+            return [StageTask(stage, (), (str(work.all_alignments),), is_done)]
 
 
 def task_ids(

@@ -139,7 +139,7 @@ def segments(
     only are left out. ``change`` records the work. WorkspaceError when a session was not described.
     """
     change = change or Change()
-    folder = work.path / "index" / variant
+    folder = work.segments(variant)
     words = {f.name: w for f in work.sessions() if (w := session_words(f, variant)) is not None}
     lacking = [n for n in names if not work.session(n).words_json.exists()]
     if lacking:
@@ -170,7 +170,7 @@ def update(work: Workspace) -> dict[str, dict[str, Any]]:
         )
     out: dict[str, dict[str, Any]] = {}
     for variant in variants:
-        folder = work.path / "index" / variant
+        folder = work.segments(variant)
         change = Change()
         with _locked(folder):
             _remove_damaged(_open_all(folder, variant)[0], variant)
