@@ -102,12 +102,14 @@ def contradiction(one: Mounted, other: Mounted) -> str:
         for k, axis in enumerate("xyz"):
             if abs(turn[k]) * NEAR_VOXELS > LEAST and f"rotation_{axis}_rad" in hidden:
                 degrees = np.degrees(abs(turn[k]))
-                return _text(frame, one.base_frame, f"turned by {degrees:.1f} degrees about {axis}")
+                return _unclear(
+                    frame, one.base_frame, f"turned by {degrees:.1f} degrees about {axis}"
+                )
             if abs(shift[k]) <= LEAST * one.voxel:
                 continue
             if axis != "z" and f"lever_{axis}_m" in hidden:
                 shifted = f"shifted by {abs(shift[k]):.2f} m along {axis}"
-                return _text(frame, one.base_frame, shifted)
+                return _unclear(frame, one.base_frame, shifted)
             if axis == "z" and abs(height + shift[k]) < ALIKE * abs(shift[k]):
                 return (
                     f"'{frame}' is mounted in '{one.base_frame}' at z = {first[2, 3]:.2f} m in one"
@@ -117,7 +119,7 @@ def contradiction(one: Mounted, other: Mounted) -> str:
     return ""
 
 
-def _text(frame: str, base_frame: str, difference: str) -> str:
+def _unclear(frame: str, base_frame: str, difference: str) -> str:
     return (
         f"'{frame}' is mounted in '{base_frame}' {difference} between both, and their drives are"
         " too straight or too short to show which is right"

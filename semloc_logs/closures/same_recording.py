@@ -35,7 +35,7 @@ def same_recordings(maps: Mapping[str, SessionMap]) -> list[str]:
             if count >= least:
                 shared[frozenset((first, second))] = count
     return [
-        f"Sessions {_listed(names)} are of one recording: {_most(shared, names)} of their keyframes"
+        f"Sessions {_names(names)} are of one recording: {_most(shared, names)} of their keyframes"
         " are the same measurements, and closures between these show nothing; give each recording"
         " once."
         for names in _sets(shared)
@@ -56,7 +56,7 @@ def _most(shared: Mapping[frozenset[str], int], names: Sequence[str]) -> int:
     return max(count for pair, count in shared.items() if pair <= {*names})
 
 
-def _listed(names: Sequence[str]) -> str:
+def _names(names: Sequence[str]) -> str:
     """All names, or the first ones of many."""
     if len(names) <= MOST_NAMES:
         return f"{', '.join(names[:-1])} and {names[-1]}"

@@ -13,7 +13,7 @@ from semloc_logs.labels.sweep_ground import GroundSurface
 
 
 class GeometryLabels(Labeller):
-    """Ground, construction, vegetation and poles by the shape of what is around a point."""
+    """Ground, construction, vegetation and poles by the shape of the surroundings."""
 
     source = "geometry"
 

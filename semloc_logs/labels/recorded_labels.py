@@ -310,17 +310,17 @@ def _doubts(name: str, topic: _Topic, space: LabelSpace) -> Iterator[str]:
             f"--set labels.space=NAME chooses another."
         )
     if space.unknown and topic.decided_by is _DecidedBy.LOG:
-        yield f"Classes of {name} that mean nothing here are unlabelled: {_listed(space.unknown)}."
+        yield f"Classes of {name} that mean nothing here are unlabelled: {_first(space.unknown)}."
     if topic.strange:
         colours = sorted(topic.strange, key=lambda c: (-topic.strange[c], c))
         names = [f"({c >> 16}, {c >> 8 & 255}, {c & 255})" for c in colours]
         yield (
             f"{sum(topic.strange.values())} points have colours of {name} that {space.name} does "
-            f"not have and are unlabelled: {_listed(names)}."
+            f"not have and are unlabelled: {_first(names)}."
         )
 
 
-def _listed(names: Any, most: int = 8) -> str:
+def _first(names: Any, most: int = 8) -> str:
     listed = [str(n)[:40] for n in names]
     return ", ".join(listed[:most]) + (
         f" and {len(listed) - most} more" if len(listed) > most else ""

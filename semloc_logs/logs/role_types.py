@@ -73,9 +73,9 @@ def no_sensor(streams: Sequence[Stream]) -> str:
     scans = [s for s in recorded if kind_of(s.type) in SCANS]
     remedy = f"name one with {', or '.join(ways)}" if ways else "record clouds or depth images"
     if scans:
-        return f"{_listed(scans)} is a 2-D scan, and a 2-D scan cannot be mapped: {remedy}."
+        return f"{_topics(scans)} is a 2-D scan, and a 2-D scan cannot be mapped: {remedy}."
     return (
-        f"No topic is a LIDAR, depth images or a stereo pair; its topics are {_listed(recorded)}; "
+        f"No topic is a LIDAR, depth images or a stereo pair; its topics are {_topics(recorded)}; "
         f"{remedy}."
     )
 
@@ -95,7 +95,7 @@ def packets(streams: Sequence[Stream]) -> list[Problem]:
     ]
 
 
-def _listed(streams: Iterable[Stream]) -> str:
+def _topics(streams: Iterable[Stream]) -> str:
     return ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams) or "none"
 
 
@@ -169,7 +169,7 @@ def _split(streams: Sequence[Stream], wanted: str, flag: str) -> tuple[str, str]
                 return topic, ""
             if name.startswith(f"{spelled(topic)}:"):
                 return topic, name[len(spelled(topic)) + 1 :]
-    listed = _listed(sorted(streams, key=lambda s: s.topic))
+    listed = _topics(sorted(streams, key=lambda s: s.topic))
     raise TopicError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
 
 
@@ -188,7 +188,7 @@ def _that_can(role: str, streams: Sequence[Stream], topic: str, flag: str) -> li
                 f"{flag}: {topic} is a {scans[0].type}, and a 2-D scan cannot be mapped."
             )
         types = " or ".join(sorted({s.type for s in of_topic}))
-        listed = _listed(sorted(streams, key=lambda s: s.topic))
+        listed = _topics(sorted(streams, key=lambda s: s.topic))
         raise TopicError(
             f"{flag}: messages of type {types} cannot be the {role}; the topics are {listed}."
         )

@@ -181,7 +181,7 @@ def _degrees(a: F64, b: F64) -> float:
 def _none(expected: Expected) -> Problem:
     return _assumption(
         expected,
-        f"too few flat places show which way is up: {_text(expected.convention)} of frame "
+        f"too few flat places show which way is up: {_axis(expected.convention)} of frame "
         f"'{expected.frame}' is taken as up by convention",
     )
 
@@ -190,8 +190,8 @@ def _doubt(expected: Expected, up: F64, other: F64) -> Problem:
     by = "by convention" if expected.imu is None else f"by {expected.imu_topic}"
     return _assumption(
         expected,
-        f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
-        f"'{expected.frame}' is taken as up {by}, but {_text(other)} fits better",
+        f"the ground and the walls of the map do not settle which way is up: {_axis(up)} of frame "
+        f"'{expected.frame}' is taken as up {by}, but {_axis(other)} fits better",
         expected.imu_topic if expected.imu is not None else "",
     )
 
@@ -200,8 +200,8 @@ def _unsettled(expected: Expected, up: F64, other: F64) -> Problem:
     """The convention fits as well as another direction: such as floor and ceiling of a room."""
     return _assumption(
         expected,
-        f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
-        f"'{expected.frame}' is taken as up by convention, and {_text(other)} fits about as well",
+        f"the ground and the walls of the map do not settle which way is up: {_axis(up)} of frame "
+        f"'{expected.frame}' is taken as up by convention, and {_axis(other)} fits about as well",
     )
 
 
@@ -222,7 +222,7 @@ def _contradiction(expected: Expected, up: F64) -> Problem:
     return _assumption(
         expected,
         f"{expected.imu_topic} contradicts the map: its up is {off:.0f} degrees off; "
-        f"{_text(up)} of frame '{expected.frame}' is taken as up from the ground and the walls of "
+        f"{_axis(up)} of frame '{expected.frame}' is taken as up from the ground and the walls of "
         "the map: check the axes and the sign of the accelerometer",
         expected.imu_topic,
     )
@@ -231,7 +231,7 @@ def _contradiction(expected: Expected, up: F64) -> Problem:
 def _found(expected: Expected, up: F64, *, is_sure: bool) -> Problem:
     off = _degrees(up, expected.convention)
     text = (
-        f"up is {_text(up)} of frame '{expected.frame}', {off:.0f} degrees off the convention of "
+        f"up is {_axis(up)} of frame '{expected.frame}', {off:.0f} degrees off the convention of "
         "frames, as the ground and the walls of the map show"
     )
     if is_sure:
@@ -250,7 +250,7 @@ def _assumption(expected: Expected, text: str, topic: str = "") -> Problem:
     )
 
 
-def _text(direction: F64) -> str:
+def _axis(direction: F64) -> str:
     """Such as +z, or (0.50, 0.00, 0.87)."""
     unit = direction / np.linalg.norm(direction)
     axis = int(np.argmax(np.abs(unit)))

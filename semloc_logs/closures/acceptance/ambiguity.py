@@ -75,16 +75,16 @@ def ambiguity(
     ):
         for session in sorted(set(sessions)):
             of_session = np.flatnonzero(sessions == session)
-            of_all = _about(roads.get(session, np.zeros(0)), end_roads[of_session], reach)
+            of_all = _weight_about(roads.get(session, np.zeros(0)), end_roads[of_session], reach)
             for everyone, places, weights in shown.get(session, []):
-                share = _about(places, end_roads[of_session], reach, weights) / np.maximum(
-                    np.maximum(of_all, _about(everyone, end_roads[of_session], reach)), 1.0
+                share = _weight_about(places, end_roads[of_session], reach, weights) / np.maximum(
+                    np.maximum(of_all, _weight_about(everyone, end_roads[of_session], reach)), 1.0
                 )
                 out[of_session] = np.maximum(out[of_session], np.minimum(share, 1.0))
     return out
 
 
-def _about(places: F64, road: F64, reach: float, weights: F64 | None = None) -> F64:
+def _weight_about(places: F64, road: F64, reach: float, weights: F64 | None = None) -> F64:
     """How many of ``places`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
 
     With ``weights`` (m,) the sums of these.

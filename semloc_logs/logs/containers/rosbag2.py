@@ -76,7 +76,7 @@ class Rosbag2Log(BaseLog):
 
     def _open(self) -> None:
         metadata = self._metadata()
-        self.files = self._listed(metadata) if metadata else self._found()
+        self.files = self._files_of_metadata(metadata) if metadata else self._found()
         self._open_files(self.files)
         if not (self.path / "metadata.yaml").exists():
             self._check_splits()
@@ -160,7 +160,7 @@ class Rosbag2Log(BaseLog):
             return {}
         return information
 
-    def _listed(self, metadata: dict[str, Any]) -> list[Path]:
+    def _files_of_metadata(self, metadata: dict[str, Any]) -> list[Path]:
         """The files that metadata.yaml names and that exist, whatever their folder was."""
         listed = metadata.get("relative_file_paths")
         names = (

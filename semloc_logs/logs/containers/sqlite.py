@@ -171,7 +171,7 @@ class SqliteLog(BaseLog):
             raise ValueError("it has no tables topics and messages")
         definitions = self._definitions() if "message_definitions" in tables else {}
         for id_, topic, type_, format_ in execute(
-            f"SELECT id, {_text('name')}, {_text('type')}, {_text('serialization_format')} "
+            f"SELECT id, {_blob('name')}, {_blob('type')}, {_blob('serialization_format')} "
             "FROM topics"
         ):
             if len(self._topics) == _MOST_TOPICS:
@@ -228,8 +228,8 @@ class SqliteLog(BaseLog):
         definitions = {}
         kept = 0
         rows = self._database.execute(
-            f"SELECT {_text('topic_type')}, {_text('encoding')}, "
-            f"{_text('encoded_message_definition')} FROM message_definitions"
+            f"SELECT {_blob('topic_type')}, {_blob('encoding')}, "
+            f"{_blob('encoded_message_definition')} FROM message_definitions"
         )
         for type_, encoding, text in rows:
             name = ros2_type(_decoded(type_))
@@ -241,7 +241,7 @@ class SqliteLog(BaseLog):
         return definitions
 
 
-def _text(column: str) -> str:
+def _blob(column: str) -> str:
     """A column of text as bytes: parts that are not UTF-8 are replaced, not refused."""
     return f"CAST({column} AS BLOB)"
 

@@ -49,7 +49,7 @@ class Stop:
     def begin(self, pose: F64, points: F32) -> None:
         """Compare from now on with the points (n, 3) of another cloud, in the base frame."""
         self.pose = np.array(pose)
-        self.first = _some(points, _KEPT).copy()
+        self.first = _evenly_chosen(points, _KEPT).copy()
         self.tree = None
 
     def compare(self, points: F64) -> None:
@@ -96,7 +96,7 @@ class Standstill:
             return
         if stop is None or not _is_still(stop.position, session_T_base):
             self._worst = self.worst
-            first = _some(points, _KEPT).copy()
+            first = _evenly_chosen(points, _KEPT).copy()
             position = np.array(session_T_base[:3, 3])
             self._stop = Stop(
                 position, np.array(session_T_base), first, start_ns=stamp_ns, end_ns=stamp_ns
@@ -107,7 +107,7 @@ class Standstill:
         if rotation_angle(stop.pose[:3, :3].T @ session_T_base[:3, :3]) > _TURNED:
             stop.begin(session_T_base, points)
         elif stop.seen % _EVERY == 2:
-            stop.compare(apply(session_T_base, _some(points, _COMPARED)))
+            stop.compare(apply(session_T_base, _evenly_chosen(points, _COMPARED)))
 
 
 def _is_still(position: F64, pose: F64) -> bool:
@@ -120,5 +120,5 @@ def _distance(tree: cKDTree, points: F64) -> float:
     return float(np.quantile(distances, _QUANTILE))
 
 
-def _some(points: F32, count: int) -> F32:
+def _evenly_chosen(points: F32, count: int) -> F32:
     return points[:: max(1, len(points) // count)]

@@ -394,14 +394,14 @@ def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds
     named = [fault for fault in faults if effects[fault] >= NOTED]
     texts: dict[str, float] = {}  # a turned and shifted mounting is one
     for fault in named:
-        text = _text(estimate, known, fault, stream.topic, clouds)
+        text = _fault_text(estimate, known, fault, stream.topic, clouds)
         texts[text] = max(effects[fault], texts.get(text, 0.0))
     for text, effect in texts.items():
         severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
         stream.findings.append(Finding(severity, text))
 
 
-def _text(
+def _fault_text(
     estimate: Estimate, known: Mapping[Fault, F64], fault: Fault, topic: str, clouds: Clouds
 ) -> str:
     """The sentence's end about a fault, of its ``known`` parameters (8,)."""

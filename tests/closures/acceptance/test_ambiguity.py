@@ -7,10 +7,10 @@ import pytest
 
 from semloc_logs.closures.acceptance import ambiguity as ambiguity_module
 from semloc_logs.closures.acceptance.ambiguity import (
-    _about,
     _among_copies,
     _contradictions,
     _nearest,
+    _weight_about,
     ambiguity,
 )
 from semloc_logs.closures.acceptance.placements import Placed, pairs_of
@@ -20,9 +20,9 @@ from semloc_logs.numerics.transforms import yaw_transform
 def test_things_about_a_road_are_counted_to_both_ends_of_the_reach() -> None:
     places = np.array([30.0, 0.0, 10.0, 20.0, 20.0])
     road = np.array([0.0, 15.0, 20.0, 30.0, 99.0])
-    assert _about(places, road, 10.0).tolist() == [2, 3, 4, 3, 0]
+    assert _weight_about(places, road, 10.0).tolist() == [2, 3, 4, 3, 0]
     shares = np.array([1.0, 0.5, 0.25, 0.125, 0.0625])
-    assert _about(places, road, 5.0, shares).tolist() == [0.5, 0.4375, 0.1875, 1.0, 0.0]
+    assert _weight_about(places, road, 5.0, shares).tolist() == [0.5, 0.4375, 0.1875, 1.0, 0.0]
 
 
 def test_the_nearest_of_ascending_values_and_the_first_of_two() -> None:
